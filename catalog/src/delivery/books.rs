@@ -1,0 +1,298 @@
+//! What became of each sample of one stream: the receiver's part of the books.
+
+use ddx_wire::sample::SampleMeta;
+use ddx_wire::{Epoch, Seq};
+
+use super::key;
+
+/// Counts of one stream. `expected` is the sum of all from `delivered` to `filtered`; the rest tell of copies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Books {
+    /// Samples from the first delivered one to the newest, over all epochs.
+    pub expected: u64,
+    /// Handed to the driver.
+    pub delivered: u64,
+    /// Arrived after a newer one was delivered.
+    pub late: u64,
+    /// Never arrived.
+    pub link_lost: u64,
+    /// Arrived in part, and were given up at the deadline or for a newer one.
+    pub expired: u64,
+    /// Found no room in the byte budget.
+    pub over_budget: u64,
+    /// Fragments that contradict one another.
+    pub undecodable: u64,
+    /// Left out by the source, as the contract asks.
+    pub filtered: u64,
+    /// Further copies of samples or fragments accounted for already, or from before the first delivered sample.
+    pub duplicates: u64,
+    /// Samples or fragments of an epoch that is over.
+    pub old_epoch: u64,
+}
+
+/// What became of a sample that arrived and was not delivered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Failure {
+    Expired,
+    OverBudget,
+    Undecodable,
+}
+
+/// How a sample that arrives stands to those delivered before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Standing {
+    /// Newer than all: to be delivered.
+    Newer,
+    /// The newest again.
+    Again,
+    /// Older: not to be delivered, and counted.
+    Old,
+}
+
+/// Keeps the [`Books`] of a stream, and its order: the newest sample delivered.
+#[derive(Debug, Default)]
+pub(super) struct Ledger {
+    books: Books,
+    newest: Option<Newest>,
+    /// Samples newer than the newest that failed; a repeat may still deliver them. Sorted, at most [`FAILURES`].
+    failed: Vec<(Epoch, Seq, Failure)>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Newest {
+    epoch: Epoch,
+    seq: Seq,
+    filtered: u64,
+    /// Bit `n` tells whether the sample `n` before the newest is accounted for otherwise than as lost.
+    settled: u64,
+}
+
+impl Ledger {
+    pub(super) fn books(&self) -> Books {
+        self.books
+    }
+
+    /// Epoch and number of the newest sample delivered.
+    pub(super) fn newest(&self) -> Option<(Epoch, Seq)> {
+        self.newest.map(|newest| (newest.epoch, newest.seq))
+    }
+
+    /// Judges a sample or fragment; counts it unless it is newer.
+    pub(super) fn judge(&mut self, meta: &SampleMeta) -> Standing {
+        let Some(newest) = &mut self.newest else {
+            return Standing::Newer;
+        };
+        if key(meta) > (newest.epoch, newest.seq) {
+            return Standing::Newer;
+        }
+        if meta.epoch < newest.epoch {
+            self.books.old_epoch += 1;
+            return Standing::Old;
+        }
+        let behind = newest.seq.0.saturating_sub(meta.seq.0);
+        let bit = 1_u64.checked_shl(u32::try_from(behind).unwrap_or(u32::MAX));
+        match bit {
+            Some(bit) if newest.settled & bit == 0 => {
+                newest.settled |= bit;
+                self.books.late += 1;
+                self.books.unlose();
+            }
+            Some(_) | None => self.books.duplicates += 1,
+        }
+        if behind == 0 {
+            Standing::Again
+        } else {
+            Standing::Old
+        }
+    }
+
+    /// Accounts for a sample that is [`Standing::Newer`] and is delivered now.
+    pub(super) fn deliver(&mut self, meta: &SampleMeta) {
+        let (skipped, filtered, settled) = match self.newest {
+            // What came before the first sample was never asked for, so it cannot be missed.
+            None => (0, 0, u64::MAX),
+            Some(last) if last.epoch == meta.epoch => {
+                let ahead = meta.seq.0.saturating_sub(last.seq.0);
+                let shift = u32::try_from(ahead).unwrap_or(u32::MAX);
+                (
+                    ahead.saturating_sub(1),
+                    meta.filtered.saturating_sub(last.filtered),
+                    last.settled.checked_shl(shift).unwrap_or(0) | 1,
+                )
+            }
+            Some(_) => (meta.seq.0.saturating_sub(1), meta.filtered, 1),
+        };
+        let filtered = filtered.min(skipped);
+        let books = &mut self.books;
+        books.expected = books.expected.saturating_add(skipped).saturating_add(1);
+        books.delivered += 1;
+        books.filtered = books.filtered.saturating_add(filtered);
+        books.link_lost = books.link_lost.saturating_add(skipped - filtered);
+        let mut newest = Newest {
+            epoch: meta.epoch,
+            seq: meta.seq,
+            filtered: meta.filtered,
+            settled,
+        };
+        self.failed.retain(|(epoch, seq, failure)| {
+            let passed = (*epoch, *seq) < key(meta);
+            if passed && *epoch == meta.epoch {
+                let count = match failure {
+                    Failure::Expired => &mut books.expired,
+                    Failure::OverBudget => &mut books.over_budget,
+                    Failure::Undecodable => &mut books.undecodable,
+                };
+                *count += 1;
+                books.unlose();
+                let behind = u32::try_from(meta.seq.0 - seq.0).unwrap_or(u32::MAX);
+                newest.settled |= 1_u64.checked_shl(behind).unwrap_or(0);
+            }
+            (*epoch, *seq) > key(meta)
+        });
+        self.newest = Some(newest);
+    }
+
+    /// Notes that a [`Standing::Newer`] sample was dropped. It is booked once a newer one is delivered.
+    pub(super) fn fail(&mut self, meta: &SampleMeta, failure: Failure) {
+        if Some(key(meta)) <= self.newest() {
+            return;
+        }
+        let found = self
+            .failed
+            .binary_search_by_key(&key(meta), |(epoch, seq, _)| (*epoch, *seq));
+        match found {
+            Ok(at) => {
+                if let Some(entry) = self.failed.get_mut(at) {
+                    entry.2 = failure;
+                }
+            }
+            Err(at) if self.failed.len() < FAILURES => {
+                self.failed.insert(at, (meta.epoch, meta.seq, failure));
+            }
+            // With the list full the sample is booked as lost on the link.
+            Err(_) => {}
+        }
+    }
+}
+
+impl Books {
+    /// Tells whether every expected sample is accounted for.
+    pub fn balanced(&self) -> bool {
+        let accounted = [
+            self.delivered,
+            self.late,
+            self.link_lost,
+            self.expired,
+            self.over_budget,
+            self.undecodable,
+            self.filtered,
+        ];
+        accounted.into_iter().fold(0, u64::saturating_add) == self.expected
+    }
+
+    /// Takes back a sample that was booked as missing, since its fate is known now.
+    fn unlose(&mut self) {
+        if self.link_lost > 0 {
+            self.link_lost -= 1;
+        } else if self.filtered > 0 {
+            // The source said that it left the sample out, and sent it.
+            self.filtered -= 1;
+        } else {
+            self.expected += 1;
+        }
+    }
+}
+
+/// Failed samples of a stream remembered until a newer one is delivered.
+const FAILURES: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn meta(epoch: u64, seq: u64, filtered: u64) -> SampleMeta {
+        SampleMeta {
+            epoch: Epoch(epoch),
+            seq: Seq(seq),
+            filtered,
+            ..SampleMeta::default()
+        }
+    }
+
+    fn after(samples: &[(u64, u64, u64)]) -> Ledger {
+        let mut ledger = Ledger::default();
+        for (epoch, seq, filtered) in samples {
+            let meta = meta(*epoch, *seq, *filtered);
+            if ledger.judge(&meta) == Standing::Newer {
+                ledger.deliver(&meta);
+            }
+        }
+        assert!(ledger.books().balanced(), "{:?}", ledger.books());
+        ledger
+    }
+
+    #[test]
+    fn gap_is_lost_unless_filtered() {
+        let books = after(&[(1, 10, 5), (1, 20, 12)]).books();
+        assert_eq!(books.expected, 11);
+        assert_eq!(
+            (books.delivered, books.filtered, books.link_lost),
+            (2, 7, 2)
+        );
+    }
+
+    #[test]
+    fn overtaken_sample_is_late_once_then_duplicate() {
+        let books = after(&[(1, 1, 0), (1, 3, 0), (1, 2, 0), (1, 2, 0), (1, 3, 0)]).books();
+        assert_eq!((books.delivered, books.late, books.link_lost), (2, 1, 0));
+        assert_eq!(books.duplicates, 2);
+    }
+
+    #[test]
+    fn before_the_first_is_no_loss() {
+        let books = after(&[(1, 9, 0), (1, 8, 0)]).books();
+        assert_eq!((books.expected, books.duplicates), (1, 1));
+    }
+
+    #[test]
+    fn new_epoch_counts_from_one_and_the_old_one_never_shows() {
+        let ledger = after(&[(1, 9, 0), (2, 3, 1), (1, 10, 0)]);
+        let books = ledger.books();
+        assert_eq!(ledger.newest(), Some((Epoch(2), Seq(3))));
+        assert_eq!((books.expected, books.link_lost, books.filtered), (4, 1, 1));
+        assert_eq!(books.old_epoch, 1);
+    }
+
+    #[test]
+    fn failure_is_booked_when_passed_and_forgotten_when_repaired() {
+        let mut ledger = after(&[(1, 1, 0)]);
+        ledger.fail(&meta(1, 2, 0), Failure::Expired);
+        ledger.fail(&meta(1, 3, 0), Failure::OverBudget);
+        ledger.deliver(&meta(1, 3, 0));
+        let books = ledger.books();
+        assert_eq!(
+            (books.expired, books.over_budget, books.link_lost),
+            (1, 0, 0)
+        );
+        assert!(books.balanced());
+        assert_eq!(ledger.judge(&meta(1, 2, 0)), Standing::Old);
+        assert_eq!(ledger.books().duplicates, 1);
+    }
+
+    #[test]
+    fn failure_ahead_is_kept_until_it_is_passed() {
+        let mut ledger = after(&[(1, 1, 0)]);
+        ledger.fail(&meta(1, 3, 0), Failure::Undecodable);
+        ledger.deliver(&meta(1, 2, 0));
+        assert_eq!(ledger.books().undecodable, 0);
+        ledger.deliver(&meta(1, 4, 0));
+        assert_eq!(ledger.books().undecodable, 1);
+        assert!(ledger.books().balanced());
+    }
+
+    #[test]
+    fn hostile_numbers_stay_balanced() {
+        let books = after(&[(0, 1, u64::MAX), (0, u64::MAX, 0), (1, 1, u64::MAX)]).books();
+        assert_eq!(books.delivered, 3);
+    }
+}

@@ -1,0 +1,808 @@
+//! Who has what: this host's entries, and those of every other host as far as they are known.
+//!
+//! Each host is the only writer of its own entries and numbers its changes, so knowledge about it is one number and a few
+//! ranges beyond a gap. Changes are pushed at once; a digest to one random host each second finds what was lost; who is
+//! behind asks the owner for exactly the ranges that it lacks. Everything is idempotent.
+
+mod own;
+mod schemas;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ddx_wire::message::{Delta, DigestEntry, ItemState, Message, Range, SchemaPart};
+use ddx_wire::{HostId, HostName, ItemDescription, ItemName, Pattern, SchemaHash, Tag, Time};
+
+use self::own::{ITEMS_MAX, Own};
+use self::schemas::Schemas;
+use crate::error::Error;
+use crate::event::Event;
+use crate::outbox::Outbox;
+use crate::rng::Rng;
+
+const DIGEST_PERIOD: Duration = Duration::from_secs(1);
+/// Entries of the periodic digest: few, so that idle traffic does not grow with the domain.
+const DIGEST_SLICE: usize = 8;
+/// Entries that are read of a digest: an entry takes at most 18 bytes, so these fit one datagram.
+const DIGEST_ENTRIES: usize = 60;
+/// Changes made within this time travel together.
+const PUSH_AFTER: Duration = Duration::from_millis(2);
+/// Hosts to which a change is pushed; beyond, digests spread the news.
+const PUSH_MAX: usize = 32;
+const DIGEST_FAN: usize = 8;
+/// A pushed change may be lost, so the news of it is repeated, cheaply, to a few.
+const REMINDERS: [Duration; 2] = [Duration::from_millis(120), Duration::from_millis(300)];
+/// Pause after the last part of an answer, after which the rest is asked for again.
+const PULL_QUIET: Duration = Duration::from_millis(60);
+/// Pause after a request that may be lost. It grows after some tries only: most are answered or lost, not refused.
+const PULL_RETRY: Duration = Duration::from_millis(120);
+const PULL_STEADY: u32 = 6;
+const PULL_RETRY_MAX: Duration = Duration::from_secs(1);
+/// Ranges beyond a gap that are remembered, and gaps that are asked for at one time.
+const RANGES_MAX: usize = 32;
+/// Items of all other hosts.
+const REMOTE_ITEMS_MAX: usize = 1 << 20;
+
+pub(crate) struct Directory {
+    own: Own,
+    remotes: BTreeMap<HostId, Remote>,
+    schemas: Schemas,
+    shown: BTreeMap<ItemName, (HostId, ItemName)>,
+    changed: BTreeSet<ItemName>,
+    /// First version that was not pushed yet, and when it will be.
+    push: Option<(u64, Time)>,
+    reminders: Vec<Time>,
+    next_digest: Option<Time>,
+    remote_items: usize,
+    /// Items dropped because the directory is full.
+    pub(crate) dropped: u64,
+}
+
+struct Remote {
+    tag: Tag,
+    name: HostName,
+    /// Prefix under which it is shown, when that is not its own.
+    prefix: Option<String>,
+    items: BTreeMap<ItemName, Item>,
+    have: u64,
+    target: u64,
+    beyond: Vec<Range>,
+    pull: Option<Pull>,
+    /// Whether items of an earlier life may be left.
+    renewed: bool,
+}
+
+struct Item {
+    life: Tag,
+    version: u64,
+    description: Option<ItemDescription>,
+    shown: Option<ItemName>,
+}
+
+struct Pull {
+    next: Time,
+    tries: u32,
+}
+
+/// One item of another host, for listings.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RemoteItem {
+    /// Its owner.
+    pub host: HostId,
+    /// Name under which this host shows it.
+    pub name: ItemName,
+    /// What its owner says about it.
+    pub description: ItemDescription,
+    /// Text of its schema.
+    pub schema_text: Arc<str>,
+}
+
+impl Directory {
+    pub(crate) fn new() -> Self {
+        Self {
+            own: Own::default(),
+            remotes: BTreeMap::new(),
+            schemas: Schemas::default(),
+            shown: BTreeMap::new(),
+            changed: BTreeSet::new(),
+            push: None,
+            reminders: Vec::new(),
+            next_digest: None,
+            remote_items: 0,
+            dropped: 0,
+        }
+    }
+
+    /// Number of this host's newest change.
+    pub(crate) fn version(&self) -> u64 {
+        self.own.version()
+    }
+
+    /// One of this host's items.
+    pub(crate) fn own(&self, name: &ItemName) -> Option<&ItemDescription> {
+        self.own.get(name)
+    }
+
+    pub(crate) fn announce(
+        &mut self,
+        description: ItemDescription,
+        schema_text: &str,
+        now: Time,
+    ) -> Result<(), Error> {
+        if self.own.announce(description, schema_text)? {
+            self.schedule_push(now);
+        }
+        Ok(())
+    }
+
+    pub(crate) fn withdraw(&mut self, name: &ItemName, now: Time) -> bool {
+        let known = self.own.withdraw(name);
+        if known {
+            self.schedule_push(now);
+        }
+        known
+    }
+
+    /// The owner, the owner's name and the description of an item of another host.
+    pub(crate) fn find(&self, shown: &ItemName) -> Option<(HostId, &ItemDescription)> {
+        let (host, name) = self.shown.get(shown)?;
+        let item = self.remotes.get(host)?.items.get(name)?;
+        Some((*host, item.description.as_ref()?))
+    }
+
+    /// A name whose item appeared, changed, moved or went since it was last asked.
+    pub(crate) fn poll_changed(&mut self) -> Option<ItemName> {
+        self.changed.pop_first()
+    }
+
+    /// Items of other hosts whose names fit.
+    pub(crate) fn items<'a>(
+        &'a self,
+        pattern: &'a Pattern,
+    ) -> impl Iterator<Item = RemoteItem> + 'a {
+        self.shown
+            .keys()
+            .filter(|name| pattern.matches(name))
+            .filter_map(|name| {
+                let (host, description) = self.find(name)?;
+                Some(RemoteItem {
+                    host,
+                    name: name.clone(),
+                    description: description.clone(),
+                    schema_text: Arc::clone(self.schemas.text(description.schema_hash)?),
+                })
+            })
+    }
+
+    /// Begins or goes on to follow a life of a host, whose newest change is `version`.
+    pub(crate) fn follow(
+        &mut self,
+        host: HostId,
+        tag: Tag,
+        name: &HostName,
+        version: u64,
+        now: Time,
+        out: &mut Outbox,
+    ) {
+        let remote = self.remotes.entry(host).or_insert_with(|| Remote {
+            tag,
+            name: name.clone(),
+            prefix: None,
+            items: BTreeMap::new(),
+            have: 0,
+            target: 0,
+            beyond: Vec::new(),
+            pull: None,
+            renewed: false,
+        });
+        if remote.tag != tag {
+            self.own.cancel(remote.tag);
+            remote.tag = tag;
+            remote.name = name.clone();
+            (remote.have, remote.target) = (0, 0);
+            remote.beyond.clear();
+            remote.pull = None;
+            remote.renewed = true;
+        }
+        self.next_digest.get_or_insert(now + DIGEST_PERIOD);
+        self.note_version(host, tag, version, now, out);
+    }
+
+    /// Forgets the items of a host that said goodbye.
+    pub(crate) fn forget(&mut self, host: HostId, out: &mut Outbox) {
+        let Some(remote) = self.remotes.remove(&host) else {
+            return;
+        };
+        self.own.cancel(remote.tag);
+        self.remote_items -= remote.items.len();
+        for item in remote.items.into_values() {
+            hide(&mut self.shown, &mut self.changed, host, item.shown, out);
+        }
+    }
+
+    /// Changes the prefixes under which hosts are shown; those left out are shown under their own. The hosts that moved.
+    pub(crate) fn set_prefixes(
+        &mut self,
+        prefixes: &BTreeMap<HostId, String>,
+        out: &mut Outbox,
+    ) -> Vec<HostId> {
+        let mut moved = Vec::new();
+        for (host, remote) in &mut self.remotes {
+            let prefix = prefixes.get(host);
+            if remote.prefix.as_ref() == prefix {
+                continue;
+            }
+            remote.prefix = prefix.cloned();
+            for item in remote.items.values_mut() {
+                hide(
+                    &mut self.shown,
+                    &mut self.changed,
+                    *host,
+                    item.shown.take(),
+                    out,
+                );
+            }
+            moved.push(*host);
+        }
+        for host in &moved {
+            self.show_all(*host, None, out);
+        }
+        moved
+    }
+
+    /// Learns that a host's newest change is at least `version`, and asks for what is missing.
+    pub(crate) fn note_version(
+        &mut self,
+        host: HostId,
+        tag: Tag,
+        version: u64,
+        now: Time,
+        out: &mut Outbox,
+    ) {
+        let Some(remote) = self
+            .remotes
+            .get_mut(&host)
+            .filter(|remote| remote.tag == tag)
+        else {
+            return;
+        };
+        remote.target = remote.target.max(version);
+        if remote.have < remote.target && remote.pull.is_none() {
+            remote.ask(now, out);
+        }
+        self.settle(host, out);
+    }
+
+    pub(crate) fn handle_digest(
+        &mut self,
+        from: Tag,
+        me: Tag,
+        entries: &[DigestEntry],
+        now: Time,
+        out: &mut Outbox,
+    ) -> Vec<Tag> {
+        let hosts: BTreeMap<Tag, HostId> =
+            self.remotes.iter().map(|(id, r)| (r.tag, *id)).collect();
+        let mut newer = Vec::new();
+        let mut strangers = Vec::new();
+        for entry in entries.iter().take(DIGEST_ENTRIES) {
+            let known = if entry.tag == me {
+                Some(self.own.version())
+            } else if let Some(host) = hosts.get(&entry.tag) {
+                self.note_version(*host, entry.tag, entry.version, now, out);
+                self.remotes.get(host).map(|remote| remote.have)
+            } else {
+                strangers.push(entry.tag);
+                None
+            };
+            if let Some(version) = known.filter(|version| *version > entry.version) {
+                newer.push(DigestEntry {
+                    tag: entry.tag,
+                    version,
+                });
+            }
+        }
+        if !newer.is_empty() {
+            out.send(from, &Message::Digest(newer));
+        }
+        strangers
+    }
+
+    pub(crate) fn handle_pull(&mut self, from: Tag, ranges: Vec<Range>, now: Time) {
+        self.own.order(from, ranges, true, now);
+    }
+
+    pub(crate) fn handle_schema_request(
+        &mut self,
+        from: Tag,
+        hash: SchemaHash,
+        missing: u64,
+        now: Time,
+    ) {
+        self.own.order_schema(from, hash, missing, now);
+    }
+
+    pub(crate) fn handle_schema_part(&mut self, part: SchemaPart, now: Time, out: &mut Outbox) {
+        let hash = part.hash;
+        if self.schemas.handle_part(part, now) {
+            let hosts: Vec<_> = self.remotes.keys().copied().collect();
+            for host in hosts {
+                self.show_all(host, Some(hash), out);
+            }
+        }
+    }
+
+    /// Takes in changes from their owner. `false` when they break the rules.
+    pub(crate) fn handle_delta(
+        &mut self,
+        host: HostId,
+        tag: Tag,
+        delta: Delta,
+        now: Time,
+        out: &mut Outbox,
+    ) -> bool {
+        let Some(remote) = self
+            .remotes
+            .get_mut(&host)
+            .filter(|remote| remote.tag == tag)
+        else {
+            return false;
+        };
+        let range = delta.range;
+        let inside = delta.changes.iter().all(|change| {
+            let name = match &change.item {
+                ItemState::Announced(description) => &description.name,
+                ItemState::Withdrawn(name) => name,
+            };
+            (range.from < change.version && change.version <= range.to)
+                && name.is_under(&remote.name)
+        });
+        if !inside || range.from > range.to || range.to > delta.version {
+            return false;
+        }
+        let mut names = Vec::new();
+        for change in delta.changes {
+            let (name, description) = match change.item {
+                ItemState::Announced(description) => (description.name.clone(), Some(description)),
+                ItemState::Withdrawn(name) => (name, None),
+            };
+            let known = remote.items.get(&name);
+            if known.is_some_and(|item| item.life == tag && item.version >= change.version) {
+                continue;
+            }
+            if known.is_none()
+                && (remote.items.len() >= ITEMS_MAX || self.remote_items >= REMOTE_ITEMS_MAX)
+            {
+                self.dropped = self.dropped.saturating_add(1);
+                continue;
+            }
+            if known.is_none() {
+                self.remote_items += 1;
+            }
+            let shown = known.and_then(|item| item.shown.clone());
+            let item = Item {
+                life: tag,
+                version: change.version,
+                description,
+                shown,
+            };
+            remote.items.insert(name.clone(), item);
+            names.push(name);
+        }
+        remote.target = remote.target.max(delta.version);
+        remote.merge(range);
+        if remote.have >= remote.target {
+            remote.pull = None;
+        } else if let Some(pull) = &mut remote.pull {
+            *pull = Pull {
+                next: now + PULL_QUIET,
+                tries: 0,
+            };
+        } else {
+            remote.pull = Some(Pull {
+                next: now + PULL_QUIET,
+                tries: 0,
+            });
+        }
+        for name in names {
+            self.show(host, &name, now, out);
+        }
+        self.settle(host, out);
+        true
+    }
+
+    pub(crate) fn poll_timeout(&self) -> Option<Time> {
+        let pulls = self
+            .remotes
+            .values()
+            .filter_map(|remote| Some(remote.pull.as_ref()?.next));
+        let own = [
+            self.own.poll_timeout(),
+            self.schemas.poll_timeout(),
+            self.push.map(|(_, at)| at),
+            self.reminders.first().copied(),
+            self.next_digest,
+        ];
+        pulls.chain(own.into_iter().flatten()).min()
+    }
+
+    /// Does what is due. `up` are the hosts that answer now.
+    pub(crate) fn handle_timeout(
+        &mut self,
+        now: Time,
+        me: Tag,
+        up: &[Tag],
+        rng: &mut Rng,
+        out: &mut Outbox,
+    ) {
+        let news = DigestEntry {
+            tag: me,
+            version: self.own.version(),
+        };
+        if let Some((first, _)) = self.push.filter(|(_, at)| *at <= now) {
+            self.push = None;
+            if up.len() <= PUSH_MAX {
+                let range = Range {
+                    from: first - 1,
+                    to: news.version,
+                };
+                for tag in up {
+                    self.own.order(*tag, vec![range], false, now);
+                }
+            }
+            self.reminders = REMINDERS.iter().map(|after| now + *after).collect();
+        }
+        if self.reminders.first().is_some_and(|at| *at <= now) {
+            self.reminders.remove(0);
+            let start = rng.below(up.len());
+            for tag in up.iter().cycle().skip(start).take(up.len().min(DIGEST_FAN)) {
+                out.send(*tag, &Message::Digest(vec![news]));
+            }
+        }
+        if self.next_digest.is_some_and(|at| at <= now) {
+            self.next_digest = Some(now + DIGEST_PERIOD);
+            if let Some(to) = rng.pick(up) {
+                let entries = self.digest(news, rng);
+                out.send(to, &Message::Digest(entries));
+            }
+        }
+        for remote in self.remotes.values_mut() {
+            if remote.pull.as_ref().is_some_and(|pull| pull.next <= now) {
+                remote.ask(now, out);
+            }
+        }
+        self.own.handle_timeout(now, out);
+        self.schemas.handle_timeout(now, out);
+    }
+
+    fn digest(&self, news: DigestEntry, rng: &mut Rng) -> Vec<DigestEntry> {
+        let start = rng.below(self.remotes.len());
+        let known = self.remotes.values().map(|r| DigestEntry {
+            tag: r.tag,
+            version: r.have,
+        });
+        let known = known.clone().skip(start).chain(known.take(start));
+        std::iter::once(news)
+            .chain(known)
+            .take(DIGEST_SLICE)
+            .collect()
+    }
+
+    fn schedule_push(&mut self, now: Time) {
+        let version = self.own.version();
+        self.push.get_or_insert((version, now + PUSH_AFTER));
+    }
+
+    /// Once a life is known in full, drops what only an earlier one had.
+    fn settle(&mut self, host: HostId, out: &mut Outbox) {
+        let Some(remote) = self.remotes.get_mut(&host) else {
+            return;
+        };
+        if !remote.renewed || remote.have < remote.target {
+            return;
+        }
+        remote.renewed = false;
+        let before = remote.items.len();
+        let tag = remote.tag;
+        remote.items.retain(|_, item| {
+            let stays = item.life == tag;
+            if !stays {
+                hide(
+                    &mut self.shown,
+                    &mut self.changed,
+                    host,
+                    item.shown.take(),
+                    out,
+                );
+            }
+            stays
+        });
+        self.remote_items -= before - remote.items.len();
+    }
+
+    /// Shows what is known of a host, or only the items with one schema, whose text just arrived.
+    fn show_all(&mut self, host: HostId, only: Option<SchemaHash>, out: &mut Outbox) {
+        let Some(remote) = self.remotes.get(&host) else {
+            return;
+        };
+        let fits = |item: &Item| {
+            let hash = item.description.as_ref().map(|d| d.schema_hash);
+            hash.is_some() && (only.is_none() || only == hash)
+        };
+        let names = remote
+            .items
+            .iter()
+            .filter(|(_, item)| fits(item))
+            .map(|(name, _)| name.clone());
+        for name in names.collect::<Vec<_>>() {
+            self.present(host, &name, out);
+        }
+    }
+
+    /// Shows an item that changed, once its schema text is there.
+    fn show(&mut self, host: HostId, name: &ItemName, now: Time, out: &mut Outbox) {
+        let Some(remote) = self.remotes.get_mut(&host) else {
+            return;
+        };
+        let Some(item) = remote.items.get_mut(name) else {
+            return;
+        };
+        let Some(description) = &item.description else {
+            hide(
+                &mut self.shown,
+                &mut self.changed,
+                host,
+                item.shown.take(),
+                out,
+            );
+            return;
+        };
+        if self.schemas.text(description.schema_hash).is_some() {
+            self.present(host, name, out);
+        } else if !self.schemas.want(description.schema_hash, remote.tag, now) {
+            self.dropped = self.dropped.saturating_add(1);
+        }
+    }
+
+    fn present(&mut self, host: HostId, name: &ItemName, out: &mut Outbox) {
+        let Some(remote) = self.remotes.get_mut(&host) else {
+            return;
+        };
+        let Some(item) = remote.items.get_mut(name) else {
+            return;
+        };
+        let Some(description) = item.description.clone() else {
+            return;
+        };
+        let Some(schema_text) = self.schemas.text(description.schema_hash) else {
+            return;
+        };
+        let shown = match &remote.prefix {
+            None => name.clone(),
+            Some(prefix) => match name.with_prefix(prefix) {
+                Ok(shown) => shown,
+                // The name is too long with the longer prefix: it is counted, and comes back with the short one.
+                Err(_) => {
+                    self.dropped = self.dropped.saturating_add(1);
+                    return;
+                }
+            },
+        };
+        item.shown = Some(shown.clone());
+        self.shown.insert(shown.clone(), (host, name.clone()));
+        self.changed.insert(shown.clone());
+        let schema_text = Arc::clone(schema_text);
+        out.event(Event::ItemKnown {
+            host,
+            name: shown,
+            description,
+            schema_text,
+        });
+    }
+}
+
+impl Remote {
+    /// Asks the owner for what is missing.
+    fn ask(&mut self, now: Time, out: &mut Outbox) {
+        let mut gaps = Vec::new();
+        let mut from = self.have;
+        for known in &self.beyond {
+            gaps.push(Range {
+                from,
+                to: known.from,
+            });
+            from = known.to;
+        }
+        if from < self.target {
+            gaps.push(Range {
+                from,
+                to: self.target,
+            });
+        }
+        gaps.truncate(RANGES_MAX);
+        out.send(self.tag, &Message::Pull(gaps));
+        let tries = self.pull.as_ref().map_or(0, |pull| pull.tries);
+        let pause =
+            (PULL_RETRY * 2_u32.pow(tries.saturating_sub(PULL_STEADY).min(4))).min(PULL_RETRY_MAX);
+        self.pull = Some(Pull {
+            next: now + pause,
+            tries: tries.saturating_add(1),
+        });
+    }
+
+    /// Notes that all changes within `range` are known.
+    fn merge(&mut self, range: Range) {
+        self.beyond.push(range);
+        self.beyond.sort_by_key(|known| known.from);
+        let mut rest: Vec<Range> = Vec::new();
+        for known in self.beyond.drain(..) {
+            if known.from <= self.have {
+                self.have = self.have.max(known.to);
+                continue;
+            }
+            match rest.last_mut() {
+                Some(last) if known.from <= last.to => last.to = last.to.max(known.to),
+                _ => rest.push(known),
+            }
+        }
+        // What does not fit is asked for again.
+        rest.truncate(RANGES_MAX);
+        self.beyond = rest;
+    }
+}
+
+fn hide(
+    all: &mut BTreeMap<ItemName, (HostId, ItemName)>,
+    changed: &mut BTreeSet<ItemName>,
+    host: HostId,
+    shown: Option<ItemName>,
+    out: &mut Outbox,
+) {
+    let Some(name) = shown else {
+        return;
+    };
+    // Another host may hold the name by now.
+    if all.get(&name).is_some_and(|(owner, _)| *owner == host) {
+        all.remove(&name);
+        changed.insert(name.clone());
+    }
+    out.event(Event::ItemGone { host, name });
+}
+
+#[cfg(test)]
+mod tests {
+    use ddx_wire::message::Change;
+    use ddx_wire::{Epoch, WriterState};
+
+    use super::*;
+
+    const OWNER: HostId = HostId([4; 16]);
+    const LIFE: Tag = Tag(4);
+
+    fn description(rest: &str) -> ItemDescription {
+        ItemDescription {
+            name: ItemName::parse(rest, &HostName::parse("r").unwrap()).unwrap(),
+            schema_hash: SchemaHash([1; 16]),
+            capacity_bytes: 8,
+            epoch: Epoch(1),
+            writer: WriterState::Live,
+            program: "p".to_owned(),
+        }
+    }
+
+    fn following(out: &mut Outbox) -> Directory {
+        let mut directory = Directory::new();
+        let name = HostName::parse("r").unwrap();
+        directory.follow(OWNER, LIFE, &name, 0, Time(0), out);
+        directory
+    }
+
+    fn delta(from: u64, changes: &[(u64, &str)], version: u64) -> Delta {
+        let to = changes.last().map_or(from, |(version, _)| *version);
+        let change = |(version, name): &(u64, &str)| Change {
+            version: *version,
+            item: ItemState::Announced(description(name)),
+        };
+        Delta {
+            range: Range { from, to },
+            version,
+            changes: changes.iter().map(change).collect(),
+        }
+    }
+
+    fn have(directory: &Directory) -> u64 {
+        directory.remotes[&OWNER].have
+    }
+
+    #[test]
+    fn deltas_in_any_order_meet_and_a_gap_is_asked_for() {
+        let out = &mut Outbox::default();
+        let mut directory = following(out);
+        assert!(directory.handle_delta(OWNER, LIFE, delta(4, &[(6, "c")], 6), Time(1), out));
+        assert_eq!(have(&directory), 0);
+        let due = directory.poll_timeout();
+        assert!(due.is_some_and(|at| at <= Time(1) + PULL_QUIET), "{due:?}");
+        let first = delta(0, &[(1, "a"), (4, "b")], 6);
+        assert!(directory.handle_delta(OWNER, LIFE, first.clone(), Time(2), out));
+        assert_eq!(have(&directory), 6);
+        assert!(
+            directory.handle_delta(OWNER, LIFE, first, Time(3), out),
+            "idempotent"
+        );
+        assert_eq!(have(&directory), 6);
+    }
+
+    #[test]
+    fn an_item_is_shown_once_its_schema_is_there() {
+        let out = &mut Outbox::default();
+        let mut directory = following(out);
+        directory.handle_delta(OWNER, LIFE, delta(0, &[(1, "a")], 1), Time(1), out);
+        assert!(out.pop_event().is_none());
+        let part = SchemaPart {
+            hash: SchemaHash([1; 16]),
+            index: 0,
+            count: 1,
+            bytes: b"u64".to_vec(),
+        };
+        directory.handle_schema_part(part, Time(2), out);
+        let known = out.pop_event();
+        assert!(
+            matches!(known, Some(Event::ItemKnown { schema_text, .. }) if &*schema_text == "u64")
+        );
+    }
+
+    #[test]
+    fn changes_outside_their_range_or_prefix_are_refused() {
+        let out = &mut Outbox::default();
+        let mut directory = following(out);
+        let mut lie = delta(0, &[(1, "a")], 1);
+        lie.range.to = 0;
+        assert!(!directory.handle_delta(OWNER, LIFE, lie, Time(1), out));
+        let foreign = delta(0, &[(1, "other/a")], 1);
+        assert!(!directory.handle_delta(OWNER, LIFE, foreign, Time(1), out));
+        assert!(!directory.handle_delta(OWNER, Tag(9), delta(0, &[], 0), Time(1), out));
+    }
+
+    #[test]
+    fn what_cannot_travel_is_refused_by_name() {
+        let mut directory = Directory::new();
+        let long = "x".repeat(70_000);
+        let error = directory
+            .announce(description("a"), &long, Time(0))
+            .unwrap_err();
+        assert!(
+            error
+                .to_string()
+                .contains("schema of `r/a` takes 70000 bytes")
+        );
+        let mut wordy = description("a");
+        wordy.program = "p".repeat(600);
+        let error = directory.announce(wordy, "u64", Time(0)).unwrap_err();
+        assert!(matches!(error, Error::DescriptionTooLong { .. }));
+    }
+
+    #[test]
+    fn a_full_directory_refuses_own_items_by_name_and_counts_those_of_others() {
+        let out = &mut Outbox::default();
+        let mut directory = following(out);
+        let names: Vec<String> = (0..=ITEMS_MAX).map(|number| number.to_string()).collect();
+        for name in &names[..ITEMS_MAX] {
+            directory
+                .announce(description(name), "u64", Time(0))
+                .unwrap();
+        }
+
+        let refused = directory.announce(description("more"), "u64", Time(0));
+        let changes: Vec<(u64, &str)> = (1..).zip(names.iter().map(String::as_str)).collect();
+        let all = delta(0, &changes, u64::try_from(changes.len()).unwrap());
+        assert!(directory.handle_delta(OWNER, LIFE, all, Time(1), out));
+
+        assert_eq!(
+            refused.unwrap_err().to_string(),
+            "directory is full: 65536 items; `r/more` was not announced"
+        );
+        assert_eq!(directory.remotes[&OWNER].items.len(), ITEMS_MAX);
+        assert_eq!(directory.dropped, 1);
+    }
+}

@@ -1,0 +1,78 @@
+//! Where the parts of the control plane leave what is to be sent and told.
+
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+
+use ddx_wire::Tag;
+use ddx_wire::codec;
+use ddx_wire::message::{BODY_MAX_BYTES, Greeting, Message};
+use ddx_wire::seal::HEADER_BYTES;
+
+use crate::event::Event;
+
+/// Datagrams that may wait to be sent. A driver drains after each step, so only a flood gets here.
+const QUEUE_MAX: usize = 8_192;
+
+/// Destination of a datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Dest {
+    /// One address, from the control socket.
+    Addr(SocketAddr),
+    /// The domain's beacon group, from the control socket too, so that answers arrive there.
+    Beacon,
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Target {
+    Greeting(Dest),
+    Session(Tag),
+}
+
+#[derive(Debug)]
+pub(crate) struct Outgoing {
+    pub(crate) target: Target,
+    /// Room for a header, then the message.
+    pub(crate) bytes: Vec<u8>,
+}
+
+#[derive(Default)]
+pub(crate) struct Outbox {
+    queue: VecDeque<Outgoing>,
+    events: VecDeque<Event>,
+    /// Messages that could not be queued or written.
+    pub(crate) dropped: u64,
+}
+
+impl Outbox {
+    pub(crate) fn send(&mut self, to: Tag, message: &Message) {
+        let mut bytes = vec![0; HEADER_BYTES];
+        let fits = codec::encode(message, &mut bytes).is_ok();
+        self.push(Target::Session(to), bytes, fits);
+    }
+
+    pub(crate) fn greet(&mut self, to: Dest, greeting: &Greeting) {
+        let mut bytes = vec![0; HEADER_BYTES];
+        let fits = codec::encode(greeting, &mut bytes).is_ok();
+        self.push(Target::Greeting(to), bytes, fits);
+    }
+
+    pub(crate) fn event(&mut self, event: Event) {
+        self.events.push_back(event);
+    }
+
+    pub(crate) fn pop(&mut self) -> Option<Outgoing> {
+        self.queue.pop_front()
+    }
+
+    pub(crate) fn pop_event(&mut self) -> Option<Event> {
+        self.events.pop_front()
+    }
+
+    fn push(&mut self, target: Target, bytes: Vec<u8>, fits: bool) {
+        if !fits || bytes.len() > HEADER_BYTES + BODY_MAX_BYTES || self.queue.len() >= QUEUE_MAX {
+            self.dropped = self.dropped.saturating_add(1);
+            return;
+        }
+        self.queue.push_back(Outgoing { target, bytes });
+    }
+}

@@ -1,0 +1,553 @@
+//! What others want of this host: leases, the streams that serve them, and the path of each stream.
+//!
+//! One stream serves all readers of one item under one contract. One reading host gets unicast. Two or more are offered a
+//! group, are sent both until each confirms that samples arrive there, and then the group alone; when one does not confirm
+//! although samples flow, all stay on unicast for a while.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ddx_wire::message::{AckEntry, GrantEntry, Message, Reception, RenewEntry, SubscribeEntry};
+use ddx_wire::{Contract, DomainId, ItemName, StreamId, Tag, Time};
+
+use crate::config::{SAMPLE_GROUPS, sample_group};
+use crate::delivery::{Path, ReaderHost, Route};
+use crate::event::Event;
+use crate::outbox::Outbox;
+
+const LEASE: Duration = Duration::from_secs(3);
+const TICK: Duration = Duration::from_millis(250);
+/// Pause before a group is tried again after a failed trial.
+const TRIAL_PAUSE: Duration = Duration::from_secs(30);
+const LEASES_MAX: usize = 65_536;
+const LEASES_PER_HOST_MAX: usize = 16_384;
+/// Entries of one grant: they take at most 34 bytes each, with an IPv6 group.
+const GRANTS_MAX: usize = 32;
+
+pub(crate) struct Streams {
+    domain: DomainId,
+    multicast: bool,
+    leases: BTreeMap<(Tag, u32), Lease>,
+    streams: BTreeMap<StreamId, Stream>,
+    by_item: BTreeMap<(ItemName, Contract), StreamId>,
+    last: u32,
+    next_tick: Option<Time>,
+}
+
+/// Where a reading host receives.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ReaderAddr {
+    pub(crate) data: SocketAddr,
+    pub(crate) multicast: bool,
+}
+
+struct Lease {
+    stream: StreamId,
+    at: ReaderAddr,
+    expires: Time,
+    /// Withdrawn; kept until it lapses, so that a late request cannot bring it back.
+    closed: bool,
+    group: Option<SocketAddr>,
+    reception: Reception,
+}
+
+struct Stream {
+    name: ItemName,
+    contract: Contract,
+    readers: BTreeMap<Tag, u32>,
+    route: Option<Route>,
+    unicast_until: Time,
+}
+
+/// A stream that this host sends, for listings.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StreamOut {
+    /// Its number.
+    pub stream: StreamId,
+    /// The item.
+    pub name: ItemName,
+    /// To whom, how often and by what path.
+    pub route: Route,
+}
+
+impl Streams {
+    pub(crate) fn new(domain: DomainId, multicast: bool) -> Self {
+        Self {
+            domain,
+            multicast,
+            leases: BTreeMap::new(),
+            streams: BTreeMap::new(),
+            by_item: BTreeMap::new(),
+            last: 0,
+            next_tick: None,
+        }
+    }
+
+    /// Takes in requests of a host. The number of those that exceeded a limit.
+    pub(crate) fn handle_subscribe(
+        &mut self,
+        from: Tag,
+        at: ReaderAddr,
+        entries: Vec<SubscribeEntry>,
+        exists: impl Fn(&ItemName) -> bool,
+        now: Time,
+        out: &mut Outbox,
+    ) -> u64 {
+        let mut grants = Vec::new();
+        let mut refused = 0;
+        let mut count = self.leases.range((from, 0)..=(from, u32::MAX)).count();
+        for entry in entries {
+            let key = (from, entry.want);
+            if let Some(lease) = self.leases.get_mut(&key) {
+                if !lease.closed {
+                    lease.expires = now + LEASE;
+                    let (stream, group) = (Some(lease.stream), lease.group);
+                    grants.push(GrantEntry {
+                        want: entry.want,
+                        stream,
+                        group,
+                    });
+                }
+                continue;
+            }
+            if !exists(&entry.name) {
+                grants.push(GrantEntry {
+                    want: entry.want,
+                    stream: None,
+                    group: None,
+                });
+                continue;
+            }
+            if count >= LEASES_PER_HOST_MAX || self.leases.len() >= LEASES_MAX {
+                refused += 1;
+                continue;
+            }
+            count += 1;
+            let id = self.stream_for(entry.name, entry.contract);
+            let held = (entry.epoch, entry.seq);
+            let lease = Lease {
+                stream: id,
+                at,
+                expires: now + LEASE,
+                closed: false,
+                group: None,
+                reception: Reception::Unknown,
+            };
+            self.leases.insert(key, lease);
+            if let Some(stream) = self.streams.get_mut(&id)
+                && let Some(before) = stream.readers.insert(from, entry.want)
+            {
+                // The same host asked for the same thing under another number: the newer one counts.
+                self.leases.remove(&(from, before));
+            }
+            self.route(id, now, out);
+            out.event(Event::Held {
+                stream: id,
+                tag: from,
+                epoch: held.0,
+                seq: held.1,
+            });
+            let group = self.leases.get(&key).and_then(|lease| lease.group);
+            grants.push(GrantEntry {
+                want: entry.want,
+                stream: Some(id),
+                group,
+            });
+        }
+        for grants in grants.chunks(GRANTS_MAX) {
+            out.send(from, &Message::Grant(grants.to_vec()));
+        }
+        self.next_tick.get_or_insert(now + TICK);
+        refused
+    }
+
+    /// Takes in goodbyes of a host.
+    pub(crate) fn handle_unsubscribe(
+        &mut self,
+        from: Tag,
+        wants: &[u32],
+        now: Time,
+        out: &mut Outbox,
+    ) {
+        for want in wants {
+            if let Some(lease) = self.leases.get_mut(&(from, *want))
+                && !lease.closed
+            {
+                lease.closed = true;
+                lease.expires = now + LEASE;
+                let stream = lease.stream;
+                self.leave(stream, from, *want, now, out);
+            }
+        }
+    }
+
+    /// Takes in a renewal. The interests in it that are not known.
+    pub(crate) fn handle_renew(
+        &mut self,
+        from: Tag,
+        at: ReaderAddr,
+        entries: &[RenewEntry],
+        now: Time,
+        out: &mut Outbox,
+    ) -> Vec<u32> {
+        let mut unknown = Vec::new();
+        let mut grants = Vec::new();
+        for entry in entries {
+            let lease = self
+                .leases
+                .get_mut(&(from, entry.want))
+                .filter(|lease| !lease.closed);
+            let Some(lease) = lease else {
+                unknown.push(entry.want);
+                continue;
+            };
+            lease.expires = now + LEASE;
+            let stream = lease.stream;
+            let joined = entry.joined && lease.group.is_some();
+            let reception = if joined {
+                entry.reception
+            } else {
+                Reception::Unknown
+            };
+            let changed = lease.at.data != at.data || lease.reception != reception;
+            lease.at = at;
+            lease.reception = reception;
+            if entry.joined != lease.group.is_some() {
+                let (stream, group) = (Some(stream), lease.group);
+                grants.push(GrantEntry {
+                    want: entry.want,
+                    stream,
+                    group,
+                });
+            }
+            let (epoch, seq) = (entry.epoch, entry.seq);
+            out.event(Event::Held {
+                stream,
+                tag: from,
+                epoch,
+                seq,
+            });
+            if changed {
+                self.route(stream, now, out);
+            }
+        }
+        for grants in grants.chunks(GRANTS_MAX) {
+            out.send(from, &Message::Grant(grants.to_vec()));
+        }
+        unknown
+    }
+
+    /// Takes in acks of a host.
+    pub(crate) fn handle_ack(&mut self, from: Tag, entries: &[AckEntry], out: &mut Outbox) {
+        for entry in entries {
+            let stream = self.streams.get(&entry.stream);
+            if stream.is_none_or(|stream| !stream.readers.contains_key(&from)) {
+                continue;
+            }
+            out.event(Event::Held {
+                stream: entry.stream,
+                tag: from,
+                epoch: entry.epoch,
+                seq: entry.seq,
+            });
+        }
+    }
+
+    /// Forgets what a host wanted.
+    pub(crate) fn drop_reader(&mut self, reader: Tag, now: Time, out: &mut Outbox) {
+        let leases = self.leases.range((reader, 0)..=(reader, u32::MAX));
+        let leases: Vec<_> = leases
+            .map(|((_, want), lease)| (*want, lease.stream))
+            .collect();
+        for (want, stream) in leases {
+            self.leases.remove(&(reader, want));
+            self.leave(stream, reader, want, now, out);
+        }
+    }
+
+    /// Ends the streams of an item that was withdrawn.
+    pub(crate) fn drop_item(&mut self, name: &ItemName, out: &mut Outbox) {
+        let ended = self
+            .streams
+            .iter()
+            .filter(|(_, stream)| stream.name == *name);
+        let ended: Vec<_> = ended.map(|(id, _)| *id).collect();
+        for id in ended {
+            if let Some(stream) = self.streams.remove(&id) {
+                self.by_item.remove(&(stream.name, stream.contract));
+                out.event(Event::CloseStream { stream: id });
+            }
+            self.leases.retain(|_, lease| lease.stream != id);
+        }
+    }
+
+    /// Whether a host reads something here.
+    pub(crate) fn serves(&self, reader: Tag) -> bool {
+        self.leases
+            .range((reader, 0)..=(reader, u32::MAX))
+            .any(|(_, lease)| !lease.closed)
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = StreamOut> {
+        self.streams.iter().filter_map(|(id, stream)| {
+            Some(StreamOut {
+                stream: *id,
+                name: stream.name.clone(),
+                route: stream.route.clone()?,
+            })
+        })
+    }
+
+    pub(crate) fn poll_timeout(&self) -> Option<Time> {
+        self.next_tick
+    }
+
+    /// Ends leases that lapsed, and tries groups again that failed a while ago.
+    pub(crate) fn handle_timeout(&mut self, now: Time, out: &mut Outbox) {
+        if self.next_tick.is_none_or(|at| at > now) {
+            return;
+        }
+        let lapsed = self.leases.iter().filter(|(_, lease)| lease.expires <= now);
+        let lapsed: Vec<_> = lapsed.map(|(key, lease)| (*key, lease.stream)).collect();
+        for ((reader, want), stream) in lapsed {
+            self.leases.remove(&(reader, want));
+            self.leave(stream, reader, want, now, out);
+        }
+        let tried: Vec<_> = self
+            .streams
+            .iter()
+            .filter(|(_, stream)| stream.readers.len() >= 2)
+            .map(|(id, _)| *id)
+            .collect();
+        for id in tried {
+            self.route(id, now, out);
+        }
+        // A lease ends on time; one that was withdrawn has nothing left to end.
+        let held = self.leases.values().filter(|lease| !lease.closed);
+        let first = held.map(|lease| lease.expires).min();
+        let tick = now + TICK;
+        self.next_tick =
+            (!self.leases.is_empty()).then(|| first.map_or(tick, |first| first.min(tick)));
+    }
+
+    fn stream_for(&mut self, name: ItemName, contract: Contract) -> StreamId {
+        let key = (name.clone(), contract);
+        if let Some(id) = self.by_item.get(&key) {
+            return *id;
+        }
+        // Zero stands for a mixture of streams. Numbers come round after four thousand million streams.
+        self.last = self.last.checked_add(1).unwrap_or(1);
+        let id = StreamId(self.last);
+        self.by_item.insert(key, id);
+        let stream = Stream {
+            name,
+            contract,
+            readers: BTreeMap::new(),
+            route: None,
+            unicast_until: Time(0),
+        };
+        self.streams.insert(id, stream);
+        id
+    }
+
+    /// Removes a reader from a stream, and the stream with its last reader.
+    fn leave(&mut self, id: StreamId, reader: Tag, want: u32, now: Time, out: &mut Outbox) {
+        let Some(stream) = self.streams.get_mut(&id) else {
+            return;
+        };
+        if stream.readers.get(&reader) != Some(&want) {
+            return;
+        }
+        stream.readers.remove(&reader);
+        if stream.readers.is_empty() {
+            if let Some(stream) = self.streams.remove(&id) {
+                self.by_item.remove(&(stream.name, stream.contract));
+            }
+            out.event(Event::CloseStream { stream: id });
+        } else {
+            self.route(id, now, out);
+        }
+    }
+
+    /// Settles the path of a stream, tells the sender, and offers the group to those who do not know of it.
+    fn route(&mut self, id: StreamId, now: Time, out: &mut Outbox) {
+        let Some(stream) = self.streams.get_mut(&id) else {
+            return;
+        };
+        let leases = stream.readers.iter();
+        let leases = leases.filter_map(|(tag, want)| self.leases.get(&(*tag, *want)));
+        let capable = leases.clone().all(|lease| lease.at.multicast);
+        let all_arrive = leases
+            .clone()
+            .all(|lease| lease.reception == Reception::Arrives);
+        if leases
+            .clone()
+            .any(|lease| lease.reception == Reception::Silent)
+        {
+            stream.unicast_until = now + TRIAL_PAUSE;
+        }
+        let tried =
+            self.multicast && capable && stream.readers.len() >= 2 && now >= stream.unicast_until;
+        let group = tried.then(|| sample_group(self.domain, group_index(&stream.name)));
+        let path = match group {
+            None => Path::Unicast,
+            Some(group) if all_arrive => Path::Multicast(group),
+            Some(group) => Path::Both(group),
+        };
+        let readers = stream.readers.iter().filter_map(|(tag, want)| {
+            let lease = self.leases.get(&(*tag, *want))?;
+            Some(ReaderHost {
+                tag: *tag,
+                addr: lease.at.data,
+            })
+        });
+        let route = Route {
+            contract: stream.contract,
+            readers: readers.collect(),
+            path,
+        };
+        if stream.route.as_ref() != Some(&route) {
+            let first = stream.route.is_none();
+            stream.route = Some(route.clone());
+            out.event(if first {
+                Event::OpenStream {
+                    stream: id,
+                    name: stream.name.clone(),
+                    route,
+                }
+            } else {
+                Event::UpdateStream { stream: id, route }
+            });
+        }
+        for (tag, want) in &stream.readers {
+            if let Some(lease) = self.leases.get_mut(&(*tag, *want))
+                && lease.group != group
+            {
+                lease.group = group;
+                lease.reception = Reception::Unknown;
+                let stream = Some(id);
+                out.send(
+                    *tag,
+                    &Message::Grant(vec![GrantEntry {
+                        want: *want,
+                        stream,
+                        group,
+                    }]),
+                );
+            }
+        }
+    }
+}
+
+/// Items spread over the groups by a hash of their names that every host computes alike: FNV-1a.
+fn group_index(name: &ItemName) -> u8 {
+    let hash = name.as_str().bytes().fold(0x811c_9dc5_u32, |hash, byte| {
+        (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)
+    });
+    let index = hash % u32::from(SAMPLE_GROUPS);
+    u8::try_from(index).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use ddx_wire::{Epoch, HostName, Seq};
+
+    use super::*;
+
+    const NOW: Time = Time(1_000_000_000);
+
+    fn item() -> ItemName {
+        ItemName::parse("gps", &HostName::parse("r").unwrap()).unwrap()
+    }
+
+    fn reader(streams: &mut Streams, host: u64, want: u32, at: Time, out: &mut Outbox) {
+        let entry = SubscribeEntry {
+            want,
+            name: item(),
+            contract: Contract::default(),
+            epoch: Epoch(0),
+            seq: Seq(0),
+        };
+        let addr = ReaderAddr {
+            data: "10.0.0.2:5".parse().unwrap(),
+            multicast: true,
+        };
+        streams.handle_subscribe(Tag(host), addr, vec![entry], |_| true, at, out);
+    }
+
+    fn renew(streams: &mut Streams, host: u64, want: u32, reception: Reception, at: Time) -> usize {
+        let addr = ReaderAddr {
+            data: "10.0.0.2:5".parse().unwrap(),
+            multicast: true,
+        };
+        let entry = RenewEntry {
+            want,
+            epoch: Epoch(1),
+            seq: Seq(1),
+            joined: true,
+            reception,
+        };
+        let out = &mut Outbox::default();
+        streams
+            .handle_renew(Tag(host), addr, &[entry], at, out)
+            .len()
+    }
+
+    fn path(streams: &Streams) -> Option<Path> {
+        streams.iter().next().map(|stream| stream.route.path)
+    }
+
+    #[test]
+    fn the_path_follows_what_readers_report() {
+        let (mut streams, mut out) = (Streams::new(DomainId(1), true), Outbox::default());
+        reader(&mut streams, 1, 1, NOW, &mut out);
+        assert_eq!(path(&streams), Some(Path::Unicast));
+        reader(&mut streams, 2, 1, NOW, &mut out);
+        assert!(matches!(path(&streams), Some(Path::Both(_))));
+        renew(&mut streams, 1, 1, Reception::Arrives, NOW);
+        assert!(matches!(path(&streams), Some(Path::Both(_))));
+        renew(&mut streams, 2, 1, Reception::Arrives, NOW);
+        assert!(matches!(path(&streams), Some(Path::Multicast(_))));
+        renew(&mut streams, 2, 1, Reception::Silent, NOW);
+        assert_eq!(path(&streams), Some(Path::Unicast));
+    }
+
+    #[test]
+    fn a_withdrawn_interest_is_not_brought_back_by_a_late_request() {
+        let (mut streams, mut out) = (Streams::new(DomainId(1), true), Outbox::default());
+        reader(&mut streams, 1, 5, NOW, &mut out);
+        streams.handle_unsubscribe(Tag(1), &[5], NOW, &mut out);
+        assert_eq!(path(&streams), None);
+        reader(&mut streams, 1, 5, NOW, &mut out);
+        assert_eq!(path(&streams), None);
+        assert_eq!(
+            renew(&mut streams, 1, 5, Reception::Unknown, NOW),
+            1,
+            "unknown"
+        );
+        reader(&mut streams, 1, 6, NOW, &mut out);
+        assert_eq!(path(&streams), Some(Path::Unicast));
+    }
+
+    #[test]
+    fn a_lease_lapses_three_seconds_after_the_last_renewal() {
+        let (mut streams, mut out) = (Streams::new(DomainId(1), true), Outbox::default());
+        reader(&mut streams, 1, 1, NOW, &mut out);
+        let renewed = NOW + Duration::from_millis(1_100);
+        renew(&mut streams, 1, 1, Reception::Unknown, renewed);
+
+        let lapses = renewed + LEASE;
+        let mut last = NOW;
+        while let Some(at) = streams.poll_timeout().filter(|at| *at < lapses) {
+            streams.handle_timeout(at, &mut out);
+            last = at;
+        }
+
+        assert!(lapses.since(last) <= TICK, "it was looked at to the last");
+        assert_eq!(path(&streams), Some(Path::Unicast));
+        assert_eq!(streams.poll_timeout(), Some(lapses));
+        streams.handle_timeout(lapses, &mut out);
+        assert_eq!(path(&streams), None);
+    }
+}

@@ -1,0 +1,318 @@
+//! The thread that receives samples: sockets in, mirrors out.
+
+use std::collections::HashMap;
+use std::net::UdpSocket;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use anyhow::Context;
+use ddx_catalog::delivery::{Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent};
+use ddx_store::{Origin, RawWriter};
+use ddx_wire::seal::Opener;
+use ddx_wire::{ClockOffset, Epoch, Seq, StreamId, Tag, Time};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::{Traffic, count, mailbox};
+use crate::net::Channel;
+
+/// Orders that wait for the thread at most; each is small and taken at the next wake-up.
+const ORDERS: usize = 4096;
+/// Longest sleep, so that counters stay fresh.
+const SLEEP_MAX: Duration = Duration::from_secs(1);
+/// Which of the two sockets is the one of multicast samples.
+const GROUP: usize = 1;
+/// Batches taken from one socket before the other gets its turn.
+const BATCHES_PER_TURN: usize = 8;
+
+/// Number of a mirror, given by the control loop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(crate) struct MirrorId(pub(crate) u64);
+
+/// What the control loop asks of the thread.
+pub(crate) enum Order {
+    /// Open what that life of a host seals.
+    Session { tag: Tag, opener: Opener },
+    /// Accept nothing more from it.
+    DropSession(Tag),
+    /// Write samples of some stream here.
+    Mirror { mirror: MirrorId, writer: RawWriter },
+    /// Close a mirror, which removes it.
+    DropMirror(MirrorId),
+    /// Samples of that stream belong to that mirror.
+    Expect {
+        tag: Tag,
+        stream: StreamId,
+        mirror: MirrorId,
+    },
+    /// A stream is over.
+    Forget { tag: Tag, stream: StreamId },
+    /// A peer's clock against ours.
+    Clock { tag: Tag, offset: ClockOffset },
+    /// End the thread.
+    Stop,
+}
+
+/// What the thread tells the control loop.
+pub(crate) enum Notice {
+    /// What is held of a stream that fell quiet, to be acknowledged.
+    Quiet {
+        tag: Tag,
+        stream: StreamId,
+        epoch: Epoch,
+        seq: Seq,
+    },
+    /// Samples of a stream arrive by multicast.
+    OnGroup { tag: Tag, stream: StreamId },
+    /// The receiver's counters, once a second while something arrives.
+    Counters(Box<ReceiverCounters>),
+}
+
+/// The running thread.
+pub(crate) struct Rx {
+    orders: mailbox::Sender<Order>,
+    thread: JoinHandle<()>,
+}
+
+struct State {
+    channels: [Channel; 2],
+    receiver: Receiver,
+    mirrors: HashMap<MirrorId, Mirror>,
+    streams: HashMap<(Tag, StreamId), MirrorId>,
+    clocks: HashMap<Tag, ClockOffset>,
+    notices: mailbox::Sender<Notice>,
+    traffic: Arc<Traffic>,
+    told: Time,
+    spin: bool,
+}
+
+struct Mirror {
+    writer: RawWriter,
+    newest: (Epoch, Seq),
+}
+
+impl Rx {
+    /// Starts the thread on the socket of unicast samples and the one of multicast samples.
+    pub(crate) fn start(
+        data: UdpSocket,
+        group: UdpSocket,
+        config: ReceiverConfig,
+        notices: mailbox::Sender<Notice>,
+        traffic: Arc<Traffic>,
+        spin: bool,
+    ) -> anyhow::Result<Self> {
+        let (orders, inbox) =
+            mailbox::mailbox(ORDERS).context("making the queue of the receiving thread")?;
+        let sockets = [data.try_clone()?, group.try_clone()?];
+        let now = ddx_store::now();
+        let mut state = State {
+            channels: [Channel::new(data)?, Channel::new(group)?],
+            receiver: Receiver::new(config),
+            mirrors: HashMap::new(),
+            streams: HashMap::new(),
+            clocks: HashMap::new(),
+            notices,
+            traffic,
+            told: now,
+            spin,
+        };
+        let thread = thread::Builder::new()
+            .name("ddx-rx".to_owned())
+            .spawn(move || state.run(&sockets, &inbox))
+            .context("starting the receiving thread")?;
+        Ok(Self { orders, thread })
+    }
+
+    /// Gives an order. Never waits; the error says that the thread is far behind.
+    pub(crate) fn order(&self, order: Order) -> anyhow::Result<()> {
+        self.orders
+            .send(order)
+            .map_err(|_order| anyhow::anyhow!("the receiving thread has {ORDERS} orders waiting"))
+    }
+
+    /// Ends the thread and waits for it.
+    pub(crate) fn stop(self) {
+        if self.order(Order::Stop).is_ok() && self.thread.join().is_err() {
+            tracing::error!("the receiving thread panicked");
+        }
+    }
+}
+
+impl State {
+    fn run(&mut self, sockets: &[UdpSocket; 2], inbox: &mailbox::Receiver<Order>) {
+        loop {
+            for order in inbox.drain() {
+                if matches!(order, Order::Stop) {
+                    return;
+                }
+                self.obey(order);
+            }
+            let mut arrived = false;
+            for index in 0..self.channels.len() {
+                arrived |= self.receive(index);
+            }
+            let now = ddx_store::now();
+            self.receiver.handle_timeout(now);
+            self.report(now);
+            if !arrived && !self.spin {
+                self.sleep([sockets[0].as_fd(), sockets[1].as_fd(), inbox.as_fd()], now);
+            }
+        }
+    }
+
+    fn sleep(&self, fds: [BorrowedFd<'_>; 3], now: Time) {
+        let span = self
+            .receiver
+            .poll_timeout()
+            .map_or(SLEEP_MAX, |(at, _why)| at.since(now).min(SLEEP_MAX));
+        let span = Timespec {
+            tv_sec: i64::try_from(span.as_secs()).unwrap_or(1),
+            tv_nsec: span.subsec_nanos().into(),
+        };
+        let mut fds = fds.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+        // A signal or a time-out both mean: look again.
+        poll(&mut fds, Some(&span)).ok();
+    }
+
+    /// Takes what one socket has, up to a bound, so that neither socket nor the orders starve.
+    fn receive(&mut self, index: usize) -> bool {
+        let Self {
+            channels,
+            receiver,
+            mirrors,
+            streams,
+            clocks,
+            traffic,
+            ..
+        } = self;
+        let mut total = 0;
+        for _turn in 0..BATCHES_PER_TURN {
+            let taken = channels[index].receive(|_from, datagram| {
+                count(&traffic.received_datagrams, 1);
+                count(&traffic.received_bytes, datagram.len());
+                let now = ddx_store::now();
+                receiver.handle_datagram(datagram, index == GROUP, now);
+                while let Some(sample) = receiver.poll_sample() {
+                    let mirror = streams
+                        .get(&(sample.tag, sample.stream))
+                        .and_then(|id| mirrors.get_mut(id));
+                    if let Some(mirror) = mirror {
+                        mirror.take(&sample, clocks.get(&sample.tag), now, traffic);
+                    }
+                }
+            });
+            match taken {
+                Ok(0) => break,
+                Ok(taken) => total += taken,
+                Err(error) => {
+                    tracing::debug!(%error, "receiving samples");
+                    break;
+                }
+            }
+        }
+        total > 0
+    }
+
+    fn obey(&mut self, order: Order) {
+        match order {
+            Order::Session { tag, opener } => self.receiver.session(tag, opener),
+            Order::DropSession(tag) => {
+                self.receiver.drop_session(tag);
+                self.clocks.remove(&tag);
+                self.streams
+                    .retain(|(sender, _stream), _mirror| *sender != tag);
+            }
+            Order::Mirror { mirror, writer } => {
+                self.mirrors.insert(
+                    mirror,
+                    Mirror {
+                        writer,
+                        newest: Default::default(),
+                    },
+                );
+            }
+            Order::DropMirror(mirror) => {
+                self.mirrors.remove(&mirror);
+                self.streams.retain(|_key, id| *id != mirror);
+            }
+            Order::Expect {
+                tag,
+                stream,
+                mirror,
+            } => {
+                self.receiver.listen(tag, stream);
+                self.streams.insert((tag, stream), mirror);
+            }
+            Order::Forget { tag, stream } => {
+                self.receiver.forget(tag, stream);
+                self.streams.remove(&(tag, stream));
+            }
+            Order::Clock { tag, offset } => {
+                self.clocks.insert(tag, offset);
+            }
+            Order::Stop => {}
+        }
+    }
+
+    fn report(&mut self, now: Time) {
+        while let Some(event) = self.receiver.poll_event() {
+            let notice = match event {
+                ReceiverEvent::Quiet {
+                    tag,
+                    stream,
+                    epoch,
+                    seq,
+                } => Notice::Quiet {
+                    tag,
+                    stream,
+                    epoch,
+                    seq,
+                },
+                ReceiverEvent::OnGroup { tag, stream } => Notice::OnGroup { tag, stream },
+            };
+            // A full queue costs one acknowledgement, which the next renewal makes good.
+            self.notices.send(notice).ok();
+        }
+        if now.since(self.told) >= SLEEP_MAX {
+            self.told = now;
+            self.notices
+                .send(Notice::Counters(Box::new(self.receiver.counters())))
+                .ok();
+        }
+    }
+}
+
+impl Mirror {
+    fn take(
+        &mut self,
+        sample: &Received<'_>,
+        clock: Option<&ClockOffset>,
+        now: Time,
+        traffic: &Traffic,
+    ) {
+        let meta = &sample.meta;
+        if (meta.epoch, meta.seq) <= self.newest {
+            count(&traffic.stale_samples, 1);
+            return;
+        }
+        // Without a measured clock the owner's instants say nothing here: the age is unknown, and says so.
+        let local = |at: Time| clock.map_or(now, |clock| clock.to_local(at).min(now));
+        let origin = Origin {
+            epoch: meta.epoch,
+            seq: meta.seq,
+            filtered: meta.filtered,
+            capture: local(meta.capture),
+            publish: local(meta.publish),
+            receive: Some(now),
+            bound_ns: Some(clock.map_or(u64::MAX, |clock| clock.bound_ns)),
+        };
+        match self.writer.write_with(sample.payload, &origin) {
+            Ok(_position) => self.newest = (meta.epoch, meta.seq),
+            Err(error) => {
+                tracing::debug!(%error, "sample not mirrored");
+                count(&traffic.refused_samples, 1);
+            }
+        }
+    }
+}

@@ -1,0 +1,342 @@
+//! The thread that sends samples: the store in, sockets out.
+//!
+//! It is an ordinary reader of each item that somebody elsewhere reads, with one bell for all of them. The store keeps
+//! the samples, so nothing is queued here: what cannot be sent now is read again when it can.
+
+use std::collections::HashMap;
+use std::io;
+use std::net::UdpSocket;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use anyhow::Context;
+use ddx_catalog::delivery::{Due, Route, Sender, SenderConfig, SenderEvent};
+use ddx_store::{Meta, RawGuard, RawReader, Store, WaitKey, WaitSet, Waker};
+use ddx_wire::sample::SampleMeta;
+use ddx_wire::seal::Sealer;
+use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
+
+use super::{Traffic, count, mailbox};
+use crate::net::Channel;
+
+/// Orders that wait for the thread at most; each is small and taken at the next wake-up.
+const ORDERS: usize = 4096;
+/// Longest sleep.
+const SLEEP_MAX: Duration = Duration::from_millis(100);
+/// Samples of one item sent before the next item gets its turn.
+const SAMPLES_PER_TURN: usize = 64;
+
+/// What the control loop asks of the thread.
+pub(crate) enum Order {
+    /// Somebody elsewhere reads an item.
+    Open {
+        stream: StreamId,
+        route: Route,
+        reader: Box<RawReader>,
+    },
+    /// Its readers or its path changed.
+    Update { stream: StreamId, route: Route },
+    /// Nobody reads it any longer.
+    Close(StreamId),
+    /// What a reading host says that it holds.
+    Held {
+        stream: StreamId,
+        tag: Tag,
+        epoch: Epoch,
+        seq: Seq,
+    },
+    /// How long a reading host's answers take.
+    RoundTrip { tag: Tag, time: Duration },
+    /// End the thread.
+    Stop,
+}
+
+/// The running thread.
+pub(crate) struct Tx {
+    orders: mailbox::Sender<Order>,
+    waker: Waker,
+    thread: JoinHandle<()>,
+}
+
+struct State {
+    channel: Channel,
+    sender: Sender,
+    set: WaitSet,
+    streams: HashMap<StreamId, Stream>,
+    by_key: HashMap<WaitKey, StreamId>,
+    traffic: Arc<Traffic>,
+    datagrams: Vec<u8>,
+    spin: bool,
+}
+
+/// One item under one contract, on its way out.
+struct Stream {
+    key: WaitKey,
+    limited: bool,
+    newest: (Epoch, Seq),
+    /// Samples of this epoch that were not sent: over the rate, or overwritten before they were read.
+    filtered: u64,
+    /// When the rate allows the next sample, if one is waiting for that.
+    due: Option<Time>,
+}
+
+impl Tx {
+    /// Starts the thread. `store` is a connection of its own, whose bell the thread sleeps on.
+    pub(crate) fn start(
+        socket: UdpSocket,
+        store: &Store,
+        sealer: Sealer,
+        traffic: Arc<Traffic>,
+        spin: bool,
+    ) -> anyhow::Result<Self> {
+        let (orders, inbox) =
+            mailbox::mailbox(ORDERS).context("making the queue of the sending thread")?;
+        let set = WaitSet::new(store);
+        let waker = set.waker();
+        let channel = Channel::new(socket)?;
+        let config = SenderConfig {
+            segments_max: channel.max_segments(),
+            ..SenderConfig::default()
+        };
+        let mut state = State {
+            channel,
+            sender: Sender::new(config, sealer, ddx_store::now()),
+            set,
+            streams: HashMap::new(),
+            by_key: HashMap::new(),
+            traffic,
+            datagrams: Vec::new(),
+            spin,
+        };
+        let thread = thread::Builder::new()
+            .name("ddx-tx".to_owned())
+            .spawn(move || state.run(&inbox))
+            .context("starting the sending thread")?;
+        Ok(Self {
+            orders,
+            waker,
+            thread,
+        })
+    }
+
+    /// Gives an order. Never waits; the error says that the thread is far behind.
+    pub(crate) fn order(&self, order: Order) -> anyhow::Result<()> {
+        let sent = self.orders.send(order);
+        self.waker.wake();
+        sent.map_err(|_order| anyhow::anyhow!("the sending thread has {ORDERS} orders waiting"))
+    }
+
+    /// Ends the thread and waits for it.
+    pub(crate) fn stop(self) {
+        if self.order(Order::Stop).is_ok() && self.thread.join().is_err() {
+            tracing::error!("the sending thread panicked");
+        }
+    }
+}
+
+impl State {
+    fn run(&mut self, inbox: &mailbox::Receiver<Order>) {
+        let mut rung = Vec::new();
+        loop {
+            for order in inbox.drain() {
+                if matches!(order, Order::Stop) {
+                    return;
+                }
+                self.obey(order);
+            }
+            for key in rung.drain(..) {
+                if let Some(&stream) = self.by_key.get(&key) {
+                    self.pull(stream);
+                }
+            }
+            let now = ddx_store::now();
+            self.pull_due(now);
+            self.sender.handle_timeout(now);
+            self.repeat();
+            self.send();
+            let timeout = if self.spin {
+                Duration::ZERO
+            } else {
+                self.sleep_for(ddx_store::now())
+            };
+            self.set.wait(timeout, &mut rung);
+        }
+    }
+
+    fn sleep_for(&self, now: Time) -> Duration {
+        let machine = self.sender.poll_timeout().map(|(at, _why)| at);
+        let rates = self.streams.values().filter_map(|stream| stream.due).min();
+        machine
+            .into_iter()
+            .chain(rates)
+            .min()
+            .map_or(SLEEP_MAX, |at| at.since(now).min(SLEEP_MAX))
+    }
+
+    fn obey(&mut self, order: Order) {
+        let now = ddx_store::now();
+        match order {
+            Order::Open {
+                stream,
+                route,
+                reader,
+            } => {
+                let limited = route.contract.max_rate_mhz.is_some();
+                self.sender.open(stream, route, now);
+                let key = self.set.add(*reader);
+                self.by_key.insert(key, stream);
+                self.streams.insert(
+                    stream,
+                    Stream {
+                        key,
+                        limited,
+                        newest: Default::default(),
+                        filtered: 0,
+                        due: None,
+                    },
+                );
+            }
+            Order::Update { stream, route } => self.sender.update(stream, route, now),
+            Order::Close(stream) => {
+                self.sender.close(stream);
+                if let Some(closed) = self.streams.remove(&stream) {
+                    self.by_key.remove(&closed.key);
+                    self.set.remove(closed.key);
+                }
+            }
+            Order::RoundTrip { tag, time } => self.sender.round_trip(tag, time),
+            Order::Held {
+                stream,
+                tag,
+                epoch,
+                seq,
+            } => self.sender.held(stream, tag, epoch, seq, now),
+            Order::Stop => {}
+        }
+    }
+
+    /// Sends what a stream's item has that was not sent yet, as far as its rate allows.
+    fn pull(&mut self, id: StreamId) {
+        let Self {
+            streams,
+            set,
+            sender,
+            ..
+        } = self;
+        let Some(stream) = streams.get_mut(&id) else {
+            return;
+        };
+        let Some(reader) = set.reader(stream.key) else {
+            return;
+        };
+        for _turn in 0..SAMPLES_PER_TURN {
+            if stream.limited {
+                if let Due::At(at) = sender.due(id, ddx_store::now()) {
+                    stream.due = Some(at);
+                    return;
+                }
+                stream.due = None;
+            }
+            let read = if stream.limited {
+                reader.current_pinned()
+            } else {
+                reader.next_pinned(Duration::ZERO)
+            };
+            match read {
+                Ok(Some(guard)) if stream.is_new(guard.meta()) => stream.write(id, &guard, sender),
+                Ok(Some(_)) if !stream.limited => {}
+                Ok(_) => return,
+                Err(error) => {
+                    tracing::debug!(%error, stream = id.0, "reading an item to send");
+                    return;
+                }
+            }
+        }
+        // More is waiting: take the next turn at once, after the other items.
+        set.mark(stream.key);
+    }
+
+    fn pull_due(&mut self, now: Time) {
+        let due: Vec<StreamId> = self
+            .streams
+            .iter()
+            .filter(|(_, s)| s.due.is_some_and(|at| at <= now))
+            .map(|(&id, _)| id)
+            .collect();
+        for id in due {
+            self.pull(id);
+        }
+    }
+
+    fn repeat(&mut self) {
+        while let Some(event) = self.sender.poll_event() {
+            let SenderEvent::Repeat { stream: id, to } = event;
+            let Some(stream) = self.streams.get_mut(&id) else {
+                continue;
+            };
+            let Some(reader) = self.set.reader(stream.key) else {
+                continue;
+            };
+            if let Ok(Some(guard)) = reader.current_pinned() {
+                let meta = stream.meta(guard.meta());
+                self.sender
+                    .repeat(id, to, &meta, guard.bytes(), ddx_store::now());
+            }
+        }
+    }
+
+    fn send(&mut self) {
+        self.sender.flush(ddx_store::now());
+        loop {
+            let Some(transmit) = self.sender.poll_transmit(&mut self.datagrams) else {
+                return;
+            };
+            let segment = transmit.segment.map(usize::from);
+            let datagrams = segment.map_or(1, |size| self.datagrams.len().div_ceil(size.max(1)));
+            match self.channel.send(transmit.to, &self.datagrams, segment) {
+                Ok(()) => {
+                    count(&self.traffic.sent_datagrams, datagrams);
+                    count(&self.traffic.sent_bytes, self.datagrams.len());
+                }
+                Err(error) => {
+                    count(&self.traffic.unsent_datagrams, datagrams);
+                    if error.kind() != io::ErrorKind::WouldBlock {
+                        tracing::debug!(to = %transmit.to, %error, "sending samples");
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Stream {
+    fn is_new(&self, meta: &Meta) -> bool {
+        (meta.epoch, meta.seq) > self.newest
+    }
+
+    fn write(&mut self, id: StreamId, guard: &RawGuard, sender: &mut Sender) {
+        let meta = self.meta(guard.meta());
+        self.newest = (meta.epoch, meta.seq);
+        self.filtered = meta.filtered;
+        sender.write(id, &meta, guard.bytes(), ddx_store::now());
+    }
+
+    /// What is told about a sample: all that lies between it and the last one sent was left out here.
+    fn meta(&self, meta: &Meta) -> SampleMeta {
+        let (epoch, Seq(last)) = self.newest;
+        let filtered = if meta.epoch == epoch {
+            self.filtered
+                .saturating_add(meta.seq.0.saturating_sub(last).saturating_sub(1))
+        } else {
+            meta.seq.0.saturating_sub(1)
+        };
+        SampleMeta {
+            epoch: meta.epoch,
+            seq: meta.seq,
+            filtered,
+            capture: meta.capture,
+            publish: meta.publish,
+        }
+    }
+}

@@ -1,0 +1,225 @@
+//! One host's daemon: the store's server, the control plane, the two data threads, and the loop that joins them.
+//!
+//! The loop is the one place that owns the [`Catalog`]. It makes one mutation, drains all effects, then makes the next.
+//! Without a key there is no catalog, no data thread and no socket on any network: the host serves itself.
+
+mod network;
+mod state;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use anyhow::Context;
+use ddx_store::Quotas;
+use ddx_store::server::{self, Event as StoreEvent, Server, socket_path};
+use ddx_wire::seal::DomainKey;
+use ddx_wire::{DomainId, HostName};
+use tokio::time::{MissedTickBehavior, interval};
+
+use self::network::Network;
+use self::state::Publisher;
+use crate::identity::Identity;
+
+/// How often the daemon's own state is looked at, and written when it changed.
+const STATE_PERIOD: Duration = Duration::from_secs(1);
+
+/// What a daemon is started with.
+#[derive(Clone)]
+pub struct Config {
+    /// Name of this host and prefix of its items.
+    pub host: HostName,
+    /// Number of the domain.
+    pub domain: DomainId,
+    /// Key of the domain; `None` keeps the host to itself.
+    pub key: Option<DomainKey>,
+    /// Path of the socket that programs open; `None` takes `<run>/ddx/<domain>/<host>.sock`.
+    pub socket: Option<PathBuf>,
+    /// Interfaces to use, by name or address; empty takes all that are up.
+    pub interfaces: Vec<String>,
+    /// Control endpoints of other hosts (`udp/host:port`) to greet.
+    pub join: Vec<String>,
+    /// UDP port of the control socket, 0 for an ephemeral one. A seed that others name in `join` wants a fixed one.
+    pub control_port: u16,
+    /// UDP port of unicast samples, 0 for an ephemeral one.
+    pub data_port: u16,
+    /// Whether to find others by multicast beacons.
+    pub beacon: bool,
+    /// Whether samples may travel by multicast.
+    pub multicast: bool,
+    /// Whether the data threads poll instead of sleeping: lower latency for two cores.
+    pub spin: bool,
+    /// What each program may take.
+    pub quotas: Quotas,
+}
+
+/// What a daemon says once it serves.
+#[derive(Clone, Debug)]
+pub struct Ready {
+    /// Name of this host.
+    pub host: HostName,
+    /// Number of the domain.
+    pub domain: DomainId,
+    /// Path of the socket that programs open.
+    pub socket: PathBuf,
+    /// Addresses of the control socket; empty without a key.
+    pub control: Vec<SocketAddr>,
+    /// Port on which samples arrive, with a key.
+    pub data_port: Option<u16>,
+}
+
+/// Serves one host until `shutdown` completes.
+///
+/// Calls `ready` once programs can open the store. Starts a thread for the store's server and, with a key, the two data
+/// threads; all have ended when this returns.
+///
+/// # Errors
+/// Fails when the socket, the key's network or a thread cannot be had; the message names it.
+pub async fn run(
+    config: Config,
+    ready: impl FnOnce(&Ready),
+    shutdown: impl Future<Output = ()>,
+) -> anyhow::Result<()> {
+    let mut shutdown = std::pin::pin!(shutdown);
+    let mut ready = Some(ready);
+    let mut ordinal_min = 0;
+    loop {
+        let identity = Identity::take(&config.host, config.domain.0, ordinal_min)?;
+        let mut daemon = Daemon::start(&config, identity)?;
+        if let Some(ready) = ready.take() {
+            ready(&daemon.ready);
+        }
+        let ended = daemon.serve(shutdown.as_mut()).await;
+        daemon.stop();
+        match ended? {
+            Ended::Shutdown => return Ok(()),
+            // Programs notice a restarted daemon and hand their segments over, so a new life costs them nothing.
+            Ended::Reincarnate { ordinal } => ordinal_min = ordinal.saturating_add(1),
+        }
+    }
+}
+
+/// Why a life of the daemon ended.
+enum Ended {
+    Shutdown,
+    Reincarnate { ordinal: u32 },
+}
+
+struct Daemon {
+    ready: Ready,
+    handle: server::Handle,
+    stopping: Arc<AtomicBool>,
+    server: JoinHandle<Result<(), ddx_store::Error>>,
+    /// Drains the store's bounded channel at once, so that the control loop may call the store without a deadlock.
+    forwarder: JoinHandle<bool>,
+    events: tokio::sync::mpsc::UnboundedReceiver<StoreEvent>,
+    network: Option<Network>,
+    publisher: Publisher,
+}
+
+impl Daemon {
+    fn start(config: &Config, identity: Identity) -> anyhow::Result<Self> {
+        let socket = config
+            .socket
+            .clone()
+            .unwrap_or_else(|| socket_path(&config.host, config.domain.0));
+        let mut server = Server::bind(server::Config {
+            socket: Some(socket.clone()),
+            domain: config.domain.0,
+            ordinal: identity.incarnation.ordinal,
+            quotas: config.quotas,
+            ..server::Config::new(config.host.clone())
+        })?;
+        let handle = server.handle();
+        let stopping = Arc::new(AtomicBool::new(false));
+        let stop = Arc::clone(&stopping);
+        let server = thread::Builder::new()
+            .name("ddx-store".to_owned())
+            .spawn(move || server.run(&stop))
+            .context("starting the store's thread")?;
+        let (sender, events) = tokio::sync::mpsc::unbounded_channel();
+        let news = handle.events()?;
+        let forwarder = thread::Builder::new()
+            .name("ddx-events".to_owned())
+            .spawn(move || news.into_iter().all(|event| sender.send(event).is_ok()))
+            .context("starting the thread that forwards the store's news")?;
+        let network = match &config.key {
+            Some(key) => Some(Network::start(config, identity, key, &handle)?),
+            None => None,
+        };
+        let ready = Ready {
+            host: config.host.clone(),
+            domain: config.domain,
+            socket,
+            control: network
+                .as_ref()
+                .map(|n| n.control_addrs().to_vec())
+                .unwrap_or_default(),
+            data_port: network.as_ref().map(Network::data_port),
+        };
+        let publisher = Publisher::new(&handle, identity, &ready)?;
+        Ok(Self {
+            ready,
+            handle,
+            stopping,
+            server,
+            forwarder,
+            events,
+            network,
+            publisher,
+        })
+    }
+
+    async fn serve(
+        &mut self,
+        mut shutdown: Pin<&mut impl Future<Output = ()>>,
+    ) -> anyhow::Result<Ended> {
+        let mut tick = interval(STATE_PERIOD);
+        tick.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        loop {
+            tokio::select! {
+                () = &mut shutdown => return Ok(Ended::Shutdown),
+                _ = tick.tick() => self.publisher.publish(self.network.as_ref()),
+                Some(event) = self.events.recv() => {
+                    if let Some(network) = &mut self.network {
+                        network.handle_store(event)?;
+                    }
+                }
+                ended = turn(self.network.as_mut()) => {
+                    if let Some(ordinal) = ended? {
+                        return Ok(Ended::Reincarnate { ordinal });
+                    }
+                }
+            }
+        }
+    }
+
+    fn stop(mut self) {
+        if let Some(network) = self.network.take() {
+            network.stop();
+        }
+        drop(self.publisher);
+        self.stopping.store(true, Ordering::Relaxed);
+        self.handle.wake();
+        drop(self.handle);
+        match self.server.join() {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::error!(%error, "the store's thread failed"),
+            Err(_panic) => tracing::error!("the store's thread panicked"),
+        }
+        if self.forwarder.join().is_err() {
+            tracing::error!("the thread that forwards the store's news panicked");
+        }
+    }
+}
+
+async fn turn(network: Option<&mut Network>) -> anyhow::Result<Option<u32>> {
+    match network {
+        Some(network) => network.turn().await,
+        None => std::future::pending().await,
+    }
+}

@@ -1,0 +1,636 @@
+//! The networked half of a daemon: the catalog, its two sockets, and what its events mean to the store and the threads.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::net::{SocketAddr, SocketAddrV4, ToSocketAddrs};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use ddx_catalog::delivery::{ReceiverConfig, ReceiverCounters, Route};
+use ddx_catalog::{Catalog, Config as CatalogConfig, Dest, Event, beacon_group, sample_group};
+use ddx_store::server::{Event as StoreEvent, Handle, RemoteItem};
+use ddx_store::{ReaderOptions, Schema, Store, WriterOptions};
+use ddx_wire::seal::{DomainKey, Purpose, Sealer};
+use ddx_wire::{HostId, HostName, ItemDescription, ItemName, StreamId, Tag};
+use tokio::io::Interest;
+use tokio::net::{UdpSocket, UnixStream};
+use tokio::time::sleep;
+
+use super::Config;
+use crate::data::mailbox::{self, mailbox};
+use crate::data::rx::{self, MirrorId, Rx};
+use crate::data::tx::{self, Tx};
+use crate::data::{Traffic, count};
+use crate::identity::{Identity, random};
+use crate::net::{self, Sockets};
+
+/// Notices from the receiving thread that wait at most; one more costs an acknowledgement that a renewal makes good.
+const NOTICES: usize = 4096;
+/// Datagrams taken from one socket before the loop looks at anything else.
+const DATAGRAMS_PER_TURN: usize = 64;
+/// Larger than any control datagram.
+const CONTROL_BUFFER_BYTES: usize = 2048;
+
+/// What joins the catalog to the operating system.
+pub(super) struct Network {
+    catalog: Catalog,
+    store: Store,
+    handle: Handle,
+    control: UdpSocket,
+    beacon: Option<UdpSocket>,
+    group: std::net::UdpSocket,
+    beacon_to: SocketAddr,
+    interfaces: Vec<net::Interface>,
+    control_addrs: Vec<SocketAddr>,
+    data_port: u16,
+    tx: Tx,
+    tx_store: Store,
+    rx: Rx,
+    notices: mailbox::Receiver<rx::Notice>,
+    notified: UnixStream,
+    traffic: Arc<Traffic>,
+    control_traffic: Traffic,
+    received: ReceiverCounters,
+    host: HostName,
+    hosts: BTreeMap<HostId, HostName>,
+    /// Texts of the schemas of this host's items.
+    schemas: BTreeMap<ItemName, String>,
+    remote: BTreeMap<ItemName, RemoteItem>,
+    remote_changed: bool,
+    mirrors: BTreeMap<ItemName, Mirror>,
+    last_mirror: u64,
+    reincarnate: Option<u32>,
+}
+
+struct Mirror {
+    id: MirrorId,
+    description: ItemDescription,
+    stream: Option<(Tag, StreamId)>,
+}
+
+impl Network {
+    /// Opens the sockets, starts the two data threads, and makes the catalog.
+    pub(super) fn start(
+        config: &Config,
+        identity: Identity,
+        key: &DomainKey,
+        handle: &Handle,
+    ) -> anyhow::Result<Self> {
+        let beacon_to = beacon_group(config.domain);
+        let interfaces = net::interfaces(&config.interfaces)?;
+        let sockets = Sockets::open(
+            interfaces,
+            config.control_port,
+            config.data_port,
+            v4(beacon_to).filter(|_group| config.beacon),
+            sample_group(config.domain, 0).port(),
+        )?;
+        let control_addrs = sockets.control_addrs()?;
+        let data_port = sockets.data.local_addr()?.port();
+        let seeds = config
+            .join
+            .iter()
+            .map(|seed| endpoint(seed, beacon_to.port()))
+            .collect::<anyhow::Result<Vec<_>>>()?
+            .concat();
+        let catalog = Catalog::new(
+            CatalogConfig {
+                domain: config.domain,
+                host: config.host.clone(),
+                id: identity.id,
+                incarnation: identity.incarnation,
+                key: key.clone(),
+                control_addrs: control_addrs.clone(),
+                data_port,
+                seeds,
+                beacon: config.beacon,
+                multicast: config.multicast,
+                prefix_since: ddx_store::now(),
+            },
+            u64::from_le_bytes(random()?),
+            ddx_store::now(),
+        );
+
+        let traffic = Arc::new(Traffic::default());
+        let (notify, notices) = mailbox(NOTICES).context("making the queue of the control loop")?;
+        let tx_store = handle
+            .connect()
+            .context("connecting the sending thread to the store")?;
+        let sealer = Sealer::new(key, identity.id, identity.incarnation, Purpose::Data);
+        let receiver = ReceiverConfig::new(sealer.sender(), key.id());
+        let tx = Tx::start(
+            sockets.data.try_clone()?,
+            &tx_store,
+            sealer,
+            Arc::clone(&traffic),
+            config.spin,
+        )?;
+        let rx = Rx::start(
+            sockets.data,
+            sockets.group.try_clone()?,
+            receiver,
+            notify,
+            Arc::clone(&traffic),
+            config.spin,
+        )?;
+        Ok(Self {
+            catalog,
+            store: handle
+                .connect()
+                .context("connecting the control loop to the store")?,
+            handle: handle.clone(),
+            control: UdpSocket::from_std(sockets.control)?,
+            beacon: sockets.beacon.map(UdpSocket::from_std).transpose()?,
+            group: sockets.group,
+            beacon_to,
+            interfaces: sockets.interfaces,
+            control_addrs,
+            data_port,
+            tx,
+            tx_store,
+            rx,
+            notified: UnixStream::from_std(notices.signal()?)?,
+            notices,
+            traffic,
+            control_traffic: Traffic::default(),
+            received: ReceiverCounters::default(),
+            host: config.host.clone(),
+            hosts: BTreeMap::new(),
+            schemas: BTreeMap::new(),
+            remote: BTreeMap::new(),
+            remote_changed: false,
+            mirrors: BTreeMap::new(),
+            last_mirror: 0,
+            reincarnate: None,
+        })
+    }
+
+    /// Waits for one thing to happen and does what it asks. Returns the ordinal to go above when another life of this
+    /// host was found in the domain.
+    pub(super) async fn turn(&mut self) -> anyhow::Result<Option<u32>> {
+        let wait = self
+            .catalog
+            .poll_timeout()
+            .map(|(at, _why)| at.since(ddx_store::now()));
+        tokio::select! {
+            ready = self.control.readable() => ready?,
+            ready = readable(self.beacon.as_ref()) => ready?,
+            ready = self.notified.readable() => ready?,
+            () = sleep(wait.unwrap_or_default()), if wait.is_some() => self.catalog.handle_timeout(ddx_store::now()),
+        }
+        self.receive();
+        self.take_notices();
+        self.settle()?;
+        Ok(self.reincarnate.take())
+    }
+
+    /// Does what the store's news ask of the network.
+    pub(super) fn handle_store(&mut self, event: StoreEvent) -> anyhow::Result<()> {
+        let now = ddx_store::now();
+        match event {
+            StoreEvent::Announced {
+                description,
+                schema,
+            } => {
+                self.schemas.insert(description.name.clone(), schema);
+                self.announce(description);
+            }
+            StoreEvent::Changed { description } => self.announce(description),
+            StoreEvent::Withdrawn { name } => {
+                self.schemas.remove(&name);
+                self.catalog.withdraw(&name, now);
+            }
+            StoreEvent::Wanted { name, contract } => {
+                if let Err(error) = self.catalog.subscribe(name, contract, now) {
+                    tracing::warn!(%error, "item not subscribed");
+                }
+            }
+            StoreEvent::Unwanted { name } => {
+                self.catalog.unsubscribe(&name, now);
+                self.drop_mirror(&name)?;
+            }
+        }
+        self.settle()
+    }
+
+    /// Tells the other hosts of an item of this one. Administrative items are each host's own.
+    fn announce(&mut self, description: ItemDescription) {
+        let Some(schema) = self
+            .schemas
+            .get(&description.name)
+            .filter(|_| description.name.is_under(&self.host))
+        else {
+            return;
+        };
+        let name = description.name.clone();
+        if let Err(error) = self.catalog.announce(description, schema, ddx_store::now()) {
+            tracing::warn!(item = %name, %error, "item not announced to other hosts");
+        }
+    }
+
+    /// Says goodbye and ends the threads.
+    pub(super) fn stop(mut self) {
+        self.catalog.leave(ddx_store::now());
+        self.transmit();
+        self.tx.stop();
+        self.rx.stop();
+    }
+
+    pub(super) fn control_addrs(&self) -> &[SocketAddr] {
+        &self.control_addrs
+    }
+
+    pub(super) fn data_port(&self) -> u16 {
+        self.data_port
+    }
+
+    pub(super) fn catalog(&self) -> &Catalog {
+        &self.catalog
+    }
+
+    pub(super) fn traffic(&self) -> [&Traffic; 2] {
+        [&self.control_traffic, &self.traffic]
+    }
+
+    pub(super) fn received(&self) -> &ReceiverCounters {
+        &self.received
+    }
+
+    /// Hands the names of other hosts' items to the store, if they changed. Cheap otherwise.
+    pub(super) fn publish_remote(&mut self) {
+        if std::mem::take(&mut self.remote_changed) {
+            let items = self.remote.values().cloned().collect();
+            if let Err(error) = self.handle.set_remote(items) {
+                tracing::error!(%error, "listings do not show other hosts");
+            }
+        }
+    }
+
+    /// Takes what has arrived, within a bound, before effects are drained.
+    fn receive(&mut self) {
+        let Self {
+            catalog,
+            control,
+            beacon,
+            control_traffic,
+            ..
+        } = self;
+        let mut buffer = [0; CONTROL_BUFFER_BYTES];
+        for socket in std::iter::once(&*control).chain(beacon.as_ref()) {
+            for _turn in 0..DATAGRAMS_PER_TURN {
+                match socket.try_recv_from(&mut buffer) {
+                    Ok((len, from)) => {
+                        count(&control_traffic.received_datagrams, 1);
+                        count(&control_traffic.received_bytes, len);
+                        if let Some(datagram) = buffer.get_mut(..len) {
+                            catalog.handle_datagram(from, datagram, ddx_store::now());
+                        }
+                    }
+                    Err(e) if e.kind() == io::ErrorKind::WouldBlock => break,
+                    // An unreachable peer's ICMP answer comes back as an error of a later call.
+                    Err(error) => tracing::debug!(%error, "receiving control datagrams"),
+                }
+            }
+        }
+    }
+
+    fn take_notices(&mut self) {
+        // Tells the runtime that the descriptor was emptied; the queue itself is what counts.
+        self.notified
+            .try_io(Interest::READABLE, || {
+                Err::<(), _>(io::ErrorKind::WouldBlock.into())
+            })
+            .ok();
+        for notice in self.notices.drain() {
+            match notice {
+                rx::Notice::Quiet {
+                    tag,
+                    stream,
+                    epoch,
+                    seq,
+                } => {
+                    self.catalog
+                        .holds(tag, stream, epoch, seq, true, ddx_store::now());
+                }
+                rx::Notice::OnGroup { tag, stream } => {
+                    self.catalog.heard_on_group(tag, stream, ddx_store::now());
+                }
+                rx::Notice::Counters(counters) => self.received = *counters,
+            }
+        }
+    }
+
+    /// Drains all effects of the last mutation.
+    fn settle(&mut self) -> anyhow::Result<()> {
+        self.transmit();
+        while let Some(event) = self.catalog.poll_event() {
+            self.handle_event(event)?;
+        }
+        self.transmit();
+        self.publish_remote();
+        Ok(())
+    }
+
+    fn transmit(&mut self) {
+        let mut datagram = Vec::new();
+        loop {
+            datagram.clear();
+            let Some(transmit) = self.catalog.poll_transmit(&mut datagram) else {
+                return;
+            };
+            let to = match transmit.to {
+                Dest::Addr(to) => to,
+                Dest::Beacon => self.beacon_to,
+            };
+            match self.control.try_send_to(&datagram, to) {
+                Ok(bytes) => {
+                    count(&self.control_traffic.sent_datagrams, 1);
+                    count(&self.control_traffic.sent_bytes, bytes);
+                }
+                Err(error) => {
+                    count(&self.control_traffic.unsent_datagrams, 1);
+                    tracing::debug!(%to, %error, "sending a control datagram");
+                }
+            }
+        }
+    }
+
+    fn handle_event(&mut self, event: Event) -> anyhow::Result<()> {
+        match event {
+            Event::HostUp {
+                host, name, addr, ..
+            } => {
+                tracing::info!(host = %name, %addr, "host up");
+                self.hosts.insert(host, name);
+            }
+            Event::HostUnreachable { host } => {
+                tracing::info!(host = %self.host_name(host), "host unreachable");
+            }
+            Event::HostDown { host } => tracing::info!(host = %self.host_name(host), "host down"),
+            Event::HostLeft { host } => tracing::info!(host = %self.host_name(host), "host left"),
+            Event::PrefixConflict { host, shown_as } => {
+                tracing::warn!(host = %host, shown_as, "two hosts hold one prefix\nhint: start one of them with another --host");
+            }
+            Event::Reincarnate { ordinal } => self.reincarnate = Some(ordinal),
+            Event::ItemKnown {
+                host,
+                name,
+                description,
+                schema_text,
+            } => {
+                let item = RemoteItem {
+                    host: self.host_name(host),
+                    description,
+                    schema: schema_text.to_string(),
+                };
+                self.remote.insert(name, item);
+                self.remote_changed = true;
+            }
+            Event::ItemGone { name, .. } => {
+                self.remote_changed |= self.remote.remove(&name).is_some();
+                self.drop_mirror(&name)?;
+            }
+            Event::Session { tag, opener, .. } => {
+                self.rx.order(rx::Order::Session { tag, opener })?;
+            }
+            Event::SessionClosed { tag } => self.rx.order(rx::Order::DropSession(tag))?,
+            Event::OpenStream {
+                stream,
+                name,
+                route,
+            } => self.open_stream(stream, &name, route)?,
+            Event::UpdateStream { stream, route } => {
+                self.tx.order(tx::Order::Update { stream, route })?;
+            }
+            Event::CloseStream { stream } => self.tx.order(tx::Order::Close(stream))?,
+            Event::Held {
+                stream,
+                tag,
+                epoch,
+                seq,
+            } => {
+                self.tx.order(tx::Order::Held {
+                    stream,
+                    tag,
+                    epoch,
+                    seq,
+                })?;
+            }
+            Event::Expect {
+                tag,
+                stream,
+                name,
+                description,
+            } => self.expect_stream(tag, stream, &name, description)?,
+            Event::Forget { tag, stream } => {
+                for mirror in self
+                    .mirrors
+                    .values_mut()
+                    .filter(|m| m.stream == Some((tag, stream)))
+                {
+                    mirror.stream = None;
+                }
+                self.rx.order(rx::Order::Forget { tag, stream })?;
+            }
+            Event::JoinGroup(group) => {
+                if let Some(group) = v4(group) {
+                    net::join(&self.group, *group.ip(), &self.interfaces)?;
+                }
+            }
+            Event::LeaveGroup(group) => {
+                if let Some(group) = v4(group) {
+                    net::leave(&self.group, *group.ip(), &self.interfaces);
+                }
+            }
+            Event::Clock { tag, offset } => {
+                // The bound is half the round trip and some drift, so that twice the bound covers the round trip.
+                let time = Duration::from_nanos(offset.bound_ns.saturating_mul(2));
+                self.tx.order(tx::Order::RoundTrip { tag, time })?;
+                self.rx.order(rx::Order::Clock { tag, offset })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn open_stream(
+        &mut self,
+        stream: StreamId,
+        name: &ItemName,
+        route: Route,
+    ) -> anyhow::Result<()> {
+        let reader = match self
+            .tx_store
+            .raw_reader(name.as_str(), None, ReaderOptions::default())
+        {
+            Ok(reader) => reader,
+            Err(error) => {
+                tracing::warn!(item = %name, %error, "item cannot be read to be sent");
+                return Ok(());
+            }
+        };
+        self.tx.order(tx::Order::Open {
+            stream,
+            route,
+            reader: Box::new(reader),
+        })
+    }
+
+    /// Makes ready for the samples of a stream: a mirror in the store, and the order to write it.
+    fn expect_stream(
+        &mut self,
+        tag: Tag,
+        stream: StreamId,
+        name: &ItemName,
+        description: ItemDescription,
+    ) -> anyhow::Result<()> {
+        let fits = |mirror: &Mirror| {
+            mirror.description.schema_hash == description.schema_hash
+                && mirror.description.capacity_bytes == description.capacity_bytes
+        };
+        if self.mirrors.get(name).is_some_and(|mirror| !fits(mirror)) {
+            self.drop_mirror(name)?;
+        }
+        let id = match self.mirrors.get_mut(name) {
+            Some(mirror) => {
+                mirror.stream = Some((tag, stream));
+                mirror.id
+            }
+            None => match self.open_mirror(name, description, (tag, stream)) {
+                Ok(id) => id,
+                Err(error) => {
+                    tracing::warn!(item = %name, error = %format!("{error:#}"), "item cannot be mirrored");
+                    return Ok(());
+                }
+            },
+        };
+        self.rx.order(rx::Order::Expect {
+            tag,
+            stream,
+            mirror: id,
+        })
+    }
+
+    fn open_mirror(
+        &mut self,
+        name: &ItemName,
+        description: ItemDescription,
+        stream: (Tag, StreamId),
+    ) -> anyhow::Result<MirrorId> {
+        let text = self
+            .remote
+            .get(name)
+            .map(|item| item.schema.as_str())
+            .context("its schema is not known")?;
+        let schema = Schema::parse(text).context("its owner's schema")?;
+        anyhow::ensure!(
+            schema.hash() == description.schema_hash,
+            "its owner's schema is not the one announced"
+        );
+        let options = WriterOptions {
+            capacity_bytes: Some(description.capacity_bytes),
+            ..WriterOptions::default()
+        };
+        let writer = self.store.raw_writer(name.as_str(), &schema, options)?;
+        self.last_mirror += 1;
+        let id = MirrorId(self.last_mirror);
+        self.rx.order(rx::Order::Mirror { mirror: id, writer })?;
+        self.mirrors.insert(
+            name.clone(),
+            Mirror {
+                id,
+                description,
+                stream: Some(stream),
+            },
+        );
+        Ok(id)
+    }
+
+    fn drop_mirror(&mut self, name: &ItemName) -> anyhow::Result<()> {
+        match self.mirrors.remove(name) {
+            Some(mirror) => self.rx.order(rx::Order::DropMirror(mirror.id)),
+            None => Ok(()),
+        }
+    }
+
+    fn host_name(&self, host: HostId) -> HostName {
+        self.hosts
+            .get(&host)
+            .cloned()
+            .unwrap_or_else(|| HostName::sanitised(&host.short()))
+    }
+}
+
+async fn readable(socket: Option<&UdpSocket>) -> io::Result<()> {
+    match socket {
+        Some(socket) => socket.readable().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn v4(addr: SocketAddr) -> Option<SocketAddrV4> {
+    match addr {
+        SocketAddr::V4(addr) => Some(addr),
+        SocketAddr::V6(_) => None,
+    }
+}
+
+/// Resolves an endpoint such as `udp/192.168.1.7:7447`. The transport may be left out, and so may the port: it is then
+/// `port`, where each daemon of the domain listens for greetings.
+fn endpoint(text: &str, port: u16) -> anyhow::Result<Vec<SocketAddr>> {
+    let address = match text.split_once('/') {
+        Some(("udp", address)) => address,
+        Some((transport, _)) => {
+            anyhow::bail!(
+                "endpoint `{text}`: transport `{transport}` is not known\nhint: write `udp/host:port`"
+            )
+        }
+        None => text,
+    };
+    let found = if address.contains(':') {
+        address.to_socket_addrs()
+    } else {
+        (address, port).to_socket_addrs()
+    };
+    let found: Vec<SocketAddr> = found
+        .with_context(|| format!("endpoint `{text}`\nhint: write `udp/host:port`"))?
+        .filter(SocketAddr::is_ipv4)
+        .collect();
+    anyhow::ensure!(!found.is_empty(), "endpoint `{text}` has no IPv4 address");
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_is_a_transport_an_address_and_perhaps_a_port() {
+        for text in [
+            "udp/127.0.0.1:7400",
+            "127.0.0.1:7400",
+            "udp/127.0.0.1",
+            "127.0.0.1",
+        ] {
+            assert_eq!(
+                endpoint(text, 7400).unwrap(),
+                ["127.0.0.1:7400".parse().unwrap()],
+                "{text}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_bad_endpoint_is_named() {
+        let error = format!("{:#}", endpoint("quic/127.0.0.1:7", 7400).unwrap_err());
+        assert!(
+            error.contains("`quic`") && error.contains("hint:"),
+            "{error}"
+        );
+        let error = format!(
+            "{:#}",
+            endpoint("udp/127.0.0.1:notaport", 7400).unwrap_err()
+        );
+        assert!(error.contains("`udp/127.0.0.1:notaport`"), "{error}");
+    }
+}

@@ -1,0 +1,331 @@
+//! The daemon's own state as items under `@/`, JSON each, written once a second when it changed.
+//!
+//! | item | what it holds |
+//! |---|---|
+//! | `@/self` | this host: name, id, domain, whether there is a key, addresses, ports |
+//! | `@/hosts` | the other hosts: name, id, state, address, round trip, since when |
+//! | `@/routes` | streams out and in: item, peers, path, group, rate |
+//! | `@/clock` | offset and bound of each other host's clock, nanoseconds |
+//! | `@/counters` | name to count: datagrams, bytes, drops by reason |
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use anyhow::Context as _;
+use ddx_catalog::delivery::Path;
+use ddx_catalog::{HostState, HostStatus, StreamIn, StreamOut};
+use ddx_store::server::Handle;
+use ddx_store::{RawWriter, Schema, Store, WriterOptions};
+use ddx_wire::seal::Refused;
+use ddx_wire::{ItemName, Tag};
+use serde_json::{Map, Value, json};
+
+use super::Ready;
+use super::network::Network;
+use crate::data::Traffic;
+use crate::identity::Identity;
+
+/// Smallest capacity of a state item, bytes. One that outgrows its capacity is opened anew with twice what it needs.
+const CAPACITY_BYTES: usize = 4096;
+/// Samples that a state item keeps.
+const DEPTH: u32 = 2;
+
+/// Writes the items under `@/`, and what descriptions of items say of their way.
+pub(super) struct Publisher {
+    store: Store,
+    handle: Handle,
+    notes: BTreeMap<ItemName, String>,
+    own: Value,
+    items: BTreeMap<&'static str, Item>,
+}
+
+struct Item {
+    writer: RawWriter,
+    written: Vec<u8>,
+}
+
+impl Publisher {
+    pub(super) fn new(handle: &Handle, identity: Identity, ready: &Ready) -> anyhow::Result<Self> {
+        let store = handle
+            .connect()
+            .context("connecting the daemon's own state to the store")?;
+        let own = json!({
+            "host": ready.host.as_str(),
+            "id": identity.id.to_string(),
+            "ordinal": identity.incarnation.ordinal,
+            "domain": ready.domain.0,
+            "key": ready.data_port.is_some(),
+            "socket": ready.socket,
+            "control": ready.control,
+            "data_port": ready.data_port,
+            "version": env!("CARGO_PKG_VERSION"),
+        });
+        Ok(Self {
+            store,
+            handle: handle.clone(),
+            notes: BTreeMap::new(),
+            own,
+            items: BTreeMap::new(),
+        })
+    }
+
+    /// Writes what changed since the last time.
+    pub(super) fn publish(&mut self, network: Option<&Network>) {
+        let own = self.own.clone();
+        self.write("@/self", &own);
+        let hosts = network.map(|n| n.catalog().hosts()).unwrap_or_default();
+        self.write("@/hosts", &hosts.iter().map(host).collect());
+        self.write("@/clock", &hosts.iter().filter_map(clock).collect());
+        self.write(
+            "@/routes",
+            &network.map_or_else(|| json!([]), |network| routes(network, &hosts)),
+        );
+        self.write("@/counters", &network.map_or_else(|| json!({}), counters));
+        let notes = network
+            .map(|network| notes(network, &hosts))
+            .unwrap_or_default();
+        if notes != self.notes {
+            if let Err(error) = self.handle.set_notes(notes.clone()) {
+                tracing::warn!(%error, "descriptions do not show the path of items");
+            }
+            self.notes = notes;
+        }
+    }
+
+    fn write(&mut self, name: &'static str, value: &Value) {
+        let bytes = value.to_string().into_bytes();
+        if self
+            .items
+            .get(name)
+            .is_some_and(|item| item.written == bytes)
+        {
+            return;
+        }
+        if let Err(error) = self.try_write(name, bytes) {
+            tracing::warn!(item = name, error = %format!("{error:#}"), "the daemon's state cannot be shown");
+        }
+    }
+
+    fn try_write(&mut self, name: &'static str, bytes: Vec<u8>) -> anyhow::Result<()> {
+        let fits = |item: &Item| {
+            usize::try_from(item.writer.capacity_bytes()).is_ok_and(|cap| cap >= bytes.len())
+        };
+        if !self.items.get(name).is_some_and(fits) {
+            self.items.remove(name);
+            let capacity = bytes.len().saturating_mul(2).max(CAPACITY_BYTES);
+            let options = WriterOptions {
+                depth: DEPTH,
+                capacity_bytes: Some(u32::try_from(capacity)?),
+                ..WriterOptions::default()
+            };
+            let writer = self.store.raw_writer(name, &Schema::json(), options)?;
+            self.items.insert(
+                name,
+                Item {
+                    writer,
+                    written: Vec::new(),
+                },
+            );
+        }
+        if let Some(item) = self.items.get_mut(name) {
+            item.writer.write(&bytes)?;
+            item.written = bytes;
+        }
+        Ok(())
+    }
+}
+
+fn host(status: &HostStatus) -> Value {
+    let state = match status.state {
+        HostState::Up => "up",
+        HostState::Unreachable => "unreachable",
+        HostState::Down => "down",
+        HostState::Left => "left",
+    };
+    json!({
+        "host": status.shown_as,
+        "id": status.host.to_string(),
+        "state": state,
+        "addr": status.addr,
+        "rtt_us": status.rtt.map(|rtt| rtt.as_micros()),
+        "since": status.since.0,
+    })
+}
+
+fn clock(status: &HostStatus) -> Option<Value> {
+    let clock = status.clock?;
+    Some(
+        json!({ "host": status.shown_as, "offset_ns": clock.offset_ns, "bound_ns": clock.bound_ns }),
+    )
+}
+
+fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
+    let out = network.catalog().streams_out().into_iter().map(|stream| {
+        let (path, group) = path(stream.route.path);
+        json!({
+            "name": stream.name.as_str(),
+            "direction": "out",
+            "stream": stream.stream.0,
+            "peers": peers(&stream, hosts),
+            "path": path,
+            "group": group,
+            "max_rate_mhz": stream.route.contract.max_rate_mhz,
+        })
+    });
+    let into = network.catalog().streams_in().into_iter().map(|stream| {
+        json!({
+            "name": stream.name.as_str(),
+            "direction": "in",
+            "stream": stream.stream.map(|id| id.0),
+            "peers": stream.tag.map(|tag| name_of(tag, hosts)).into_iter().collect::<Vec<_>>(),
+            "path": stream.stream.map(|_granted| path_in(&stream)),
+            "group": stream.group,
+            "max_rate_mhz": stream.contract.max_rate_mhz,
+        })
+    });
+    out.chain(into).collect()
+}
+
+/// One line for each item that travels: by which path, to or from whom.
+fn notes(network: &Network, hosts: &[HostStatus]) -> BTreeMap<ItemName, String> {
+    let mut notes: BTreeMap<ItemName, String> = BTreeMap::new();
+    for stream in network.catalog().streams_out() {
+        let (path, group) = path(stream.route.path);
+        let group = group.map_or_else(String::new, |group| format!(" {group}"));
+        let limit = stream.route.contract.max_rate_mhz;
+        let limit = limit.map_or_else(String::new, |mhz| {
+            format!(", at most {} Hz", f64::from(mhz) / 1000.0)
+        });
+        let line = format!(
+            "{path}{group} to {}{limit}",
+            peers(&stream, hosts).join(", ")
+        );
+        let note = notes.entry(stream.name).or_default();
+        if !note.is_empty() {
+            note.push_str("; ");
+        }
+        note.push_str(&line);
+    }
+    for stream in network.catalog().streams_in() {
+        let line = match (stream.tag, stream.stream) {
+            (Some(tag), Some(_)) => format!("{} from {}", path_in(&stream), name_of(tag, hosts)),
+            (Some(tag), None) => format!(
+                "asked of {}, which has not answered yet",
+                name_of(tag, hosts)
+            ),
+            (None, _) => "wanted, and no host has it".to_owned(),
+        };
+        notes.insert(stream.name, line);
+    }
+    notes
+}
+
+fn path(path: Path) -> (&'static str, Option<SocketAddr>) {
+    match path {
+        Path::Unicast => ("unicast", None),
+        Path::Multicast(group) => ("multicast", Some(group)),
+        Path::Both(group) => ("both", Some(group)),
+    }
+}
+
+fn path_in(stream: &StreamIn) -> &'static str {
+    if stream.arrives {
+        "multicast"
+    } else {
+        "unicast"
+    }
+}
+
+fn peers(stream: &StreamOut, hosts: &[HostStatus]) -> Vec<String> {
+    stream
+        .route
+        .readers
+        .iter()
+        .map(|reader| name_of(reader.tag, hosts))
+        .collect()
+}
+
+fn name_of(tag: Tag, hosts: &[HostStatus]) -> String {
+    hosts
+        .iter()
+        .find(|host| host.tag == tag)
+        .map_or_else(|| "?".to_owned(), |host| host.shown_as.clone())
+}
+
+fn counters(network: &Network) -> Value {
+    let mut counters = Map::new();
+    let mut add = |name: String, count: u64| {
+        counters.insert(name, count.into());
+    };
+    for (socket, traffic) in ["control", "data"].into_iter().zip(network.traffic()) {
+        for (what, counter) in named(traffic) {
+            add(format!("{socket}_{what}"), counter.load(Ordering::Relaxed));
+        }
+    }
+    let control = network.catalog().counters();
+    for (what, count) in [
+        ("strangers", control.strangers),
+        ("stale_responses", control.stale_responses),
+        ("stale_lives", control.stale_lives),
+        ("over_limit", control.over_limit),
+        ("membership_refused", control.membership_refused),
+        ("directory_full", control.directory_full),
+    ] {
+        add(format!("control_{what}"), count);
+    }
+    for (reason, count) in control.refused.iter() {
+        add(format!("control_{}", refused(reason)), count);
+    }
+    for (reason, count) in network.received().refused.iter() {
+        add(format!("data_{}", refused(reason)), count);
+    }
+    add(
+        "data_unwanted_records".to_owned(),
+        network.received().unwanted_records,
+    );
+    counters.into()
+}
+
+/// Name of the counter of a reason to drop datagrams: one word, for programs that read it.
+fn refused(reason: Refused) -> String {
+    format!("refused_{reason}").replace(' ', "_")
+}
+
+fn named(traffic: &Traffic) -> [(&'static str, &AtomicU64); 7] {
+    [
+        ("sent_datagrams", &traffic.sent_datagrams),
+        ("sent_bytes", &traffic.sent_bytes),
+        ("received_datagrams", &traffic.received_datagrams),
+        ("received_bytes", &traffic.received_bytes),
+        ("unsent_datagrams", &traffic.unsent_datagrams),
+        ("stale_samples", &traffic.stale_samples),
+        ("refused_samples", &traffic.refused_samples),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_reason_to_drop_a_datagram_has_a_counter_of_one_word() {
+        let names = Refused::ALL.map(refused);
+
+        assert_eq!(
+            names,
+            [
+                "refused_truncated",
+                "refused_other_protocol_version",
+                "refused_foreign_domain",
+                "refused_own_datagram",
+                "refused_unknown_sender",
+                "refused_wrong_lane",
+                "refused_unwanted_stream",
+                "refused_replayed",
+                "refused_forged",
+                "refused_malformed",
+            ]
+        );
+    }
+}

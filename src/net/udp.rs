@@ -1,0 +1,89 @@
+//! One socket that carries samples in batches: GSO on the way out, GRO on the way in (`quinn-udp`).
+
+use std::io::{self, IoSliceMut};
+use std::net::{SocketAddr, UdpSocket};
+
+use quinn_udp::{RecvMeta, Transmit, UdpSockRef, UdpSocketState};
+
+/// Buffers filled by one system call.
+const RECEIVE_BATCH: usize = 16;
+/// Largest run of datagrams that GRO joins.
+const BUFFER_BYTES: usize = 65_536;
+
+/// A UDP socket with offloads, for one thread.
+pub(crate) struct Channel {
+    socket: UdpSocket,
+    state: UdpSocketState,
+    buffers: Vec<u8>,
+}
+
+impl Channel {
+    pub(crate) fn new(socket: UdpSocket) -> io::Result<Self> {
+        let state = UdpSocketState::new(UdpSockRef::from(&socket))?;
+        Ok(Self {
+            socket,
+            state,
+            buffers: Vec::new(),
+        })
+    }
+
+    /// Sends one datagram, or a run of equal ones of `segment` bytes. A full queue is the error `WouldBlock`.
+    pub(crate) fn send(
+        &self,
+        to: SocketAddr,
+        contents: &[u8],
+        segment: Option<usize>,
+    ) -> io::Result<()> {
+        let transmit = Transmit {
+            destination: to,
+            ecn: None,
+            contents,
+            segment_size: segment,
+            src_ip: None,
+        };
+        self.state
+            .try_send(UdpSockRef::from(&self.socket), &transmit)
+    }
+
+    /// Most datagrams in one run.
+    pub(crate) fn max_segments(&self) -> usize {
+        self.state.max_gso_segments()
+    }
+
+    /// Takes what has arrived, without waiting, and hands over datagram after datagram. Returns how many there were.
+    pub(crate) fn receive(
+        &mut self,
+        mut each: impl FnMut(SocketAddr, &mut [u8]),
+    ) -> io::Result<usize> {
+        self.buffers.resize(BUFFER_BYTES * RECEIVE_BATCH, 0);
+        let mut metas = [RecvMeta::default(); RECEIVE_BATCH];
+        let mut chunks = self.buffers.chunks_exact_mut(BUFFER_BYTES);
+        let filled = {
+            let mut slices: [IoSliceMut<'_>; RECEIVE_BATCH] =
+                std::array::from_fn(|_| IoSliceMut::new(chunks.next().unwrap_or_default()));
+            match self
+                .state
+                .recv(UdpSockRef::from(&self.socket), &mut slices, &mut metas)
+            {
+                Ok(filled) => filled,
+                Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(0),
+                Err(e) => return Err(e),
+            }
+        };
+        let mut count = 0;
+        for (meta, buffer) in metas
+            .iter()
+            .zip(self.buffers.chunks_exact_mut(BUFFER_BYTES))
+            .take(filled)
+        {
+            let Some(run) = buffer.get_mut(..meta.len) else {
+                continue;
+            };
+            for datagram in run.chunks_mut(meta.stride.max(1)) {
+                each(meta.addr, datagram);
+                count += 1;
+            }
+        }
+        Ok(count)
+    }
+}

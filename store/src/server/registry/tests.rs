@@ -1,0 +1,188 @@
+//! The registry without sockets: messages in, effects out.
+
+use super::*;
+use crate::control::Purpose;
+use crate::segment::{SegmentFds, SegmentWriter, Spec};
+
+struct Bench {
+    registry: Registry,
+    serial: u32,
+}
+
+impl Bench {
+    fn new(quotas: Quotas) -> Self {
+        let (bells, fd) = Bells::create().unwrap();
+        let identity = Identity {
+            host: HostName::parse("host").unwrap(),
+            domain: 0,
+            ordinal: 3,
+            quotas,
+        };
+        Self {
+            registry: Registry::new(identity, Arc::new(bells), Arc::new(fd)),
+            serial: 0,
+        }
+    }
+
+    fn client(&mut self) -> ClientId {
+        let client = self.registry.connect(7, false, Time(0)).unwrap();
+        let program = "p".to_owned();
+        let hello = self.ask(
+            client,
+            Request::Hello {
+                version: VERSION,
+                program,
+            },
+            vec![],
+        );
+        assert!(matches!(hello, Reply::Hello { .. }));
+        client
+    }
+
+    /// The answer; what else the request has caused stays queued.
+    fn ask(&mut self, client: ClientId, request: Request, fds: Vec<OwnedFd>) -> Reply {
+        self.serial += 1;
+        let serial = self.serial;
+        let bytes = ToDaemon { serial, request }.encode().unwrap();
+        self.registry.handle(client, &bytes, fds, Time(0));
+        let at = self.registry.effects.iter().position(|effect| {
+            matches!(effect, Effect::Send { message: ToClient::Reply { serial: of, .. }, .. } if *of == serial)
+        });
+        match self.registry.effects.remove(at.unwrap()) {
+            Some(Effect::Send {
+                message: ToClient::Reply { reply, .. },
+                ..
+            }) => reply,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn open_writer(&mut self, client: ClientId, handle: u32) -> Reply {
+        let schema = Schema::scalar("u64").unwrap().text().to_owned();
+        let request = Request::OpenWriter {
+            handle,
+            name: "n".to_owned(),
+            schema,
+            purpose: Purpose::Write,
+        };
+        self.ask(client, request, vec![])
+    }
+
+    fn commit(&mut self, client: ClientId, handle: u32, epoch: Epoch) -> Reply {
+        let (_, SegmentFds { data, ctl }) = SegmentWriter::create(SPEC, epoch).unwrap();
+        self.ask(client, Request::Commit { handle }, vec![data, ctl])
+    }
+
+    fn open_reader(&mut self, client: ClientId, handle: u32) -> Reply {
+        let request = Request::OpenReader {
+            handle,
+            name: "n".to_owned(),
+            schema: None,
+            pins: 0,
+            rate_mhz: None,
+            held: None,
+        };
+        self.ask(client, request, vec![])
+    }
+
+    fn notices(&mut self) -> Vec<(ClientId, u32, Notice)> {
+        std::iter::from_fn(|| self.registry.poll_effect())
+            .filter_map(|effect| match effect {
+                Effect::Send {
+                    client,
+                    message: ToClient::Notice { handle, notice },
+                    ..
+                } => Some((client, handle, notice)),
+                Effect::Send { .. } | Effect::Disconnect { .. } | Effect::Event(_) => None,
+            })
+            .collect()
+    }
+}
+
+const SPEC: Spec = Spec {
+    capacity_bytes: 8,
+    depth: 2,
+    cells: 2,
+    pool: 0,
+};
+
+fn epoch_of(reply: &Reply) -> Epoch {
+    let Reply::Writer { epoch, .. } = reply else {
+        panic!("{reply:?}");
+    };
+    *epoch
+}
+
+#[test]
+fn a_reader_that_came_first_is_bound_when_the_segment_arrives() {
+    let mut bench = Bench::new(Quotas::default());
+    let (writer, reader) = (bench.client(), bench.client());
+    let waits = bench.open_reader(reader, 5);
+    assert!(matches!(waits, Reply::Reader { binding: None, .. }));
+
+    let granted = bench.open_writer(writer, 1);
+    assert!(bench.notices().is_empty());
+    assert_eq!(bench.commit(writer, 1, epoch_of(&granted)), Reply::Done);
+
+    let notices = bench.notices();
+    assert!(
+        matches!(&notices[..], [(to, 5, Notice::Bound(binding))] if *to == reader && binding.epoch == epoch_of(&granted))
+    );
+}
+
+#[test]
+fn every_writer_has_a_later_epoch_and_a_death_frees_the_lease() {
+    let mut bench = Bench::new(Quotas::default());
+    let (first, second) = (bench.client(), bench.client());
+    let former = epoch_of(&bench.open_writer(first, 1));
+    assert!(matches!(
+        bench.open_writer(second, 1),
+        Reply::Refused(Refusal::Held { pid: 7, .. })
+    ));
+
+    bench.registry.disconnect(first);
+
+    assert_eq!(former, Epoch::new(3, 1));
+    assert!(epoch_of(&bench.open_writer(second, 1)) > former);
+}
+
+#[test]
+fn a_segment_of_another_epoch_is_refused() {
+    let mut bench = Bench::new(Quotas::default());
+    let writer = bench.client();
+    bench.open_writer(writer, 1);
+
+    let refused = bench.commit(writer, 1, Epoch::new(9, 9));
+
+    assert!(matches!(refused, Reply::Refused(Refusal::Segment(_))));
+    assert_eq!(bench.registry.counters().bad_segments, 1);
+}
+
+#[test]
+fn a_client_that_dies_leaves_no_trace_but_its_value() {
+    let mut bench = Bench::new(Quotas::default());
+    let (writer, reader) = (bench.client(), bench.client());
+    let granted = bench.open_writer(writer, 1);
+    bench.commit(writer, 1, epoch_of(&granted));
+    bench.open_reader(reader, 1);
+    bench.open_reader(reader, 2);
+
+    bench.registry.disconnect(reader);
+    bench.registry.disconnect(writer);
+
+    assert_eq!(bench.registry.client_count(), 0);
+    let item = bench.registry.items.values().next().unwrap();
+    assert!(item.lease.is_none() && item.readers.is_empty() && item.tenure.is_some());
+}
+
+#[test]
+fn any_bytes_are_an_answer_or_the_end_of_the_connection() {
+    let mut bench = Bench::new(Quotas::default());
+    for first in 0..=255 {
+        let client = bench.client();
+        bench.registry.handle(client, &[first; 9], vec![], Time(0));
+        let told = std::iter::from_fn(|| bench.registry.poll_effect()).count();
+        assert!(told > 0, "{first} was ignored");
+        bench.registry.disconnect(client);
+    }
+}

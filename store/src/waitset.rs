@@ -1,0 +1,178 @@
+//! Waiting for many readers by one bell, at a cost that does not grow with their number.
+//!
+//! [`wait_any`](crate::wait_any) looks at each of its readers; a set looks only at those whose bell bit was rung. Bits are
+//! hints: every 100 ms it looks at all, so that a lost hint costs that much at most.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ddx_wire::Epoch;
+
+use crate::connection::Connection;
+use crate::notify::{Bell, Bells, MAX_SLICE};
+use crate::reader::RawReader;
+use crate::store::Store;
+use crate::wait::Readiness;
+
+/// Names a reader in its set; never used twice.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct WaitKey(u64);
+
+/// Readers of one store that one thread waits for.
+#[derive(Debug)]
+pub struct WaitSet {
+    connection: Arc<Connection>,
+    members: BTreeMap<WaitKey, Member>,
+    by_bit: BTreeMap<u16, Vec<WaitKey>>,
+    marked: BTreeSet<WaitKey>,
+    looked: Instant,
+    last: u64,
+}
+
+/// Ends the sleep of a set from another thread.
+#[derive(Clone, Debug)]
+pub struct Waker {
+    connection: Arc<Connection>,
+}
+
+#[derive(Debug)]
+struct Member {
+    reader: RawReader,
+    bell: Option<(u16, Epoch)>,
+}
+
+/// Rung by wakers: shared with readers, which it costs a needless look.
+const WAKER_BIT: u16 = 0;
+
+impl WaitSet {
+    /// Makes an empty set. Only one set or blocking reader at a time may sleep on the bell of `store`.
+    pub fn new(store: &Store) -> Self {
+        Self {
+            connection: store.connection(),
+            members: BTreeMap::new(),
+            by_bit: BTreeMap::new(),
+            marked: BTreeSet::new(),
+            looked: Instant::now(),
+            last: 0,
+        }
+    }
+
+    /// Puts a reader of the same store in.
+    pub fn add(&mut self, reader: RawReader) -> WaitKey {
+        self.last += 1;
+        let key = WaitKey(self.last);
+        self.members.insert(key, Member { reader, bell: None });
+        self.listen(key);
+        key
+    }
+
+    /// The reader of that key.
+    pub fn reader(&mut self, key: WaitKey) -> Option<&mut RawReader> {
+        self.members.get_mut(&key).map(|member| &mut member.reader)
+    }
+
+    /// Takes a reader out.
+    pub fn remove(&mut self, key: WaitKey) -> Option<RawReader> {
+        let member = self.members.remove(&key)?;
+        member.reader.set_waiting(false);
+        self.marked.remove(&key);
+        if let Some((bit, _)) = member.bell {
+            self.unlist(bit, key);
+        }
+        Some(member.reader)
+    }
+
+    /// Makes the next [`WaitSet::wait`] return this reader at once: it was left before it was drained.
+    pub fn mark(&mut self, key: WaitKey) {
+        self.marked.insert(key);
+    }
+
+    /// A handle that ends the sleep.
+    pub fn waker(&self) -> Waker {
+        Waker { connection: Arc::clone(&self.connection) }
+    }
+
+    /// Blocks until some reader may have something new, at most `timeout`, or until woken, and puts those into `rung`. Never
+    /// enters the kernel for a `timeout` of zero or while readers are marked. May return nothing before the time.
+    pub fn wait(&mut self, timeout: Duration, rung: &mut Vec<WaitKey>) {
+        rung.clear();
+        let (bells, client) = self.connection.bell();
+        let seen = bells.arm(client);
+        self.take(&bells, client, rung);
+        if !rung.is_empty() || timeout.is_zero() {
+            bells.disarm(client);
+        } else {
+            bells.wait(client, seen, timeout.min(MAX_SLICE));
+            self.take(&bells, client, rung);
+        }
+        for &key in rung.iter() {
+            self.listen(key);
+        }
+        if self.looked.elapsed() >= MAX_SLICE {
+            self.look(rung);
+        }
+    }
+
+    fn take(&mut self, bells: &Bells, client: u16, rung: &mut Vec<WaitKey>) {
+        rung.extend(std::mem::take(&mut self.marked));
+        for (word, mut bits) in (0_u16..).zip(bells.take_dirty(client)) {
+            while bits != 0 {
+                let low = u16::try_from(bits.trailing_zeros()).unwrap_or_default();
+                bits &= bits - 1;
+                rung.extend(self.by_bit.get(&(word * 64 + low)).into_iter().flatten());
+            }
+        }
+    }
+
+    /// Looks at all readers and at the daemon's news.
+    fn look(&mut self, rung: &mut Vec<WaitKey>) {
+        self.looked = Instant::now();
+        // A forked child has nothing to wait for; its readers say so when they are read.
+        self.connection.tend().ok();
+        let keys: Vec<WaitKey> = self.members.keys().copied().collect();
+        for key in keys {
+            self.listen(key);
+            let ready = self.members.get_mut(&key).is_some_and(|m| !matches!(m.reader.readiness(), Ok(Readiness::Waiting)));
+            if ready && !rung.contains(&key) {
+                rung.push(key);
+            }
+        }
+    }
+
+    /// Has the bell rung for the segment that the reader is bound to now, which a hand-over changes.
+    fn listen(&mut self, key: WaitKey) {
+        let Some(member) = self.members.get_mut(&key) else { return };
+        let bell = member.reader.bell_bit();
+        if bell == member.bell {
+            return;
+        }
+        member.reader.set_waiting(true);
+        let before = std::mem::replace(&mut member.bell, bell);
+        if let Some((bit, _)) = before {
+            self.unlist(bit, key);
+        }
+        if let Some((bit, _)) = bell {
+            self.by_bit.entry(bit).or_default().push(key);
+        }
+        // What was published before the bell was set rings nothing.
+        self.marked.insert(key);
+    }
+
+    fn unlist(&mut self, bit: u16, key: WaitKey) {
+        if let Some(keys) = self.by_bit.get_mut(&bit) {
+            keys.retain(|listed| *listed != key);
+            if keys.is_empty() {
+                self.by_bit.remove(&bit);
+            }
+        }
+    }
+}
+
+impl Waker {
+    /// Ends the present or the next sleep.
+    pub fn wake(&self) {
+        let (bells, client) = self.connection.bell();
+        bells.ring(Bell { client, bit: WAKER_BIT });
+    }
+}
