@@ -19,6 +19,7 @@ use ddx_store::Quotas;
 use ddx_store::server::{self, Event as StoreEvent, Server, socket_path};
 use ddx_wire::seal::DomainKey;
 use ddx_wire::{DomainId, HostName};
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::time::{MissedTickBehavior, interval};
 
 use self::network::Network;
@@ -84,6 +85,7 @@ pub async fn run(
     ready: impl FnOnce(&Ready),
     shutdown: impl Future<Output = ()>,
 ) -> anyhow::Result<()> {
+    raise_descriptor_limit();
     let mut shutdown = std::pin::pin!(shutdown);
     let mut ready = Some(ready);
     let mut ordinal_min = 0;
@@ -100,6 +102,18 @@ pub async fn run(
             // Programs notice a restarted daemon and hand their segments over, so a new life costs them nothing.
             Ended::Reincarnate { ordinal } => ordinal_min = ordinal.saturating_add(1),
         }
+    }
+}
+
+/// The store holds two descriptors for each item, and the usual soft limit is 1,024.
+fn raise_descriptor_limit() {
+    let limit = getrlimit(Resource::Nofile);
+    let raised = Rlimit {
+        current: limit.maximum,
+        ..limit
+    };
+    if let Err(error) = setrlimit(Resource::Nofile, raised) {
+        tracing::warn!(%error, current = ?limit.current, "the limit on open files stays as it is");
     }
 }
 

@@ -40,12 +40,12 @@ pub(crate) struct Sockets {
     pub(crate) interfaces: Vec<Interface>,
 }
 
-/// Finds the interfaces to use: those named (by name or address), else each that is up, else the loopback.
+/// Finds the interfaces to use: those named (by name or address), else each with an address, else the loopback. One whose
+/// cable or radio is not there yet counts: a robot starts before its link does.
 pub(crate) fn interfaces(wanted: &[String]) -> anyhow::Result<Vec<Interface>> {
     let all: Vec<(Interface, bool)> = get_if_addrs()
         .context("listing the network interfaces")?
         .into_iter()
-        .filter(|entry| entry.is_oper_up() || entry.is_loopback())
         .filter_map(|entry| {
             let loopback = entry.is_loopback();
             let IfAddr::V4(address) = entry.addr else {

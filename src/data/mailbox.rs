@@ -6,7 +6,8 @@ use std::collections::VecDeque;
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// The end that puts in. Cloned freely.
 pub(crate) struct Sender<T>(Arc<Shared<T>>);
@@ -20,6 +21,7 @@ pub(crate) struct Receiver<T> {
 struct Shared<T> {
     queue: Mutex<VecDeque<T>>,
     capacity: usize,
+    room: Condvar,
     /// One byte travels for each time that the queue stops being empty.
     signal: UnixStream,
 }
@@ -32,6 +34,7 @@ pub(crate) fn mailbox<T>(capacity: usize) -> io::Result<(Sender<T>, Receiver<T>)
     let shared = Arc::new(Shared {
         queue: Mutex::default(),
         capacity,
+        room: Condvar::new(),
         signal: theirs,
     });
     Ok((Sender(Arc::clone(&shared)), Receiver { shared, signal }))
@@ -42,6 +45,14 @@ impl<T> Shared<T> {
         // Entries are pushed and popped whole, so a panic elsewhere leaves the queue sound.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
+
+    fn push(&self, queue: &mut VecDeque<T>, entry: T) {
+        queue.push_back(entry);
+        if queue.len() == 1 {
+            // Fails only when the other end is gone.
+            (&self.signal).write_all(&[1]).ok();
+        }
+    }
 }
 
 impl<T> Sender<T> {
@@ -51,11 +62,22 @@ impl<T> Sender<T> {
         if queue.len() >= self.0.capacity {
             return Err(entry);
         }
-        queue.push_back(entry);
-        if queue.len() == 1 {
-            // Fails only when the other end is gone or already has more than it can read at a time.
-            (&self.0.signal).write_all(&[1]).ok();
+        self.0.push(&mut queue, entry);
+        Ok(())
+    }
+
+    /// Puts `entry` in. Blocks while the queue is full, at most `patience`; then gives it back.
+    pub(crate) fn send_within(&self, entry: T, patience: Duration) -> Result<(), T> {
+        let full = |queue: &mut VecDeque<T>| queue.len() >= self.0.capacity;
+        let waited = self
+            .0
+            .room
+            .wait_timeout_while(self.0.lock(), patience, full);
+        let (mut queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        if full(&mut queue) {
+            return Err(entry);
         }
+        self.0.push(&mut queue, entry);
         Ok(())
     }
 }
@@ -68,6 +90,7 @@ impl<T> Receiver<T> {
             // One byte is there: the lock keeps the queue and the descriptor in step.
             (&self.signal).read_exact(&mut [0]).ok();
         }
+        self.shared.room.notify_all();
         std::mem::take(&mut *queue)
     }
 
@@ -122,5 +145,19 @@ mod tests {
         sender.send("first").unwrap();
         assert_eq!(sender.send("second"), Err("second"));
         assert_eq!(receiver.drain(), ["first"]);
+    }
+
+    #[test]
+    fn a_full_queue_can_be_waited_for() {
+        let (sender, receiver) = mailbox(1).unwrap();
+        sender.send(1).unwrap();
+        let impatient = sender.send_within(2, Duration::ZERO);
+        assert_eq!(impatient, Err(2));
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| sender.send_within(3, Duration::from_secs(60)));
+            assert_eq!(receiver.drain(), [1]);
+            assert_eq!(waiting.join().unwrap(), Ok(()));
+        });
+        assert_eq!(receiver.drain(), [3]);
     }
 }

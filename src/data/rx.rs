@@ -19,6 +19,8 @@ use crate::net::Channel;
 
 /// Orders that wait for the thread at most; each is small and taken at the next wake-up.
 const ORDERS: usize = 4096;
+/// How long the control loop waits for a data thread: it takes its orders between two batches.
+const PATIENCE: Duration = Duration::from_secs(1);
 /// Longest sleep, so that counters stay fresh.
 const SLEEP_MAX: Duration = Duration::from_secs(1);
 /// Which of the two sockets is the one of multicast samples.
@@ -124,10 +126,10 @@ impl Rx {
         Ok(Self { orders, thread })
     }
 
-    /// Gives an order. Never waits; the error says that the thread is far behind.
+    /// Gives an order. Blocks while the thread is far behind, at most [`PATIENCE`]; then it hangs, which is the error.
     pub(crate) fn order(&self, order: Order) -> anyhow::Result<()> {
         self.orders
-            .send(order)
+            .send_within(order, PATIENCE)
             .map_err(|_order| anyhow::anyhow!("the receiving thread has {ORDERS} orders waiting"))
     }
 

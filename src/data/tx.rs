@@ -22,6 +22,8 @@ use crate::net::Channel;
 
 /// Orders that wait for the thread at most; each is small and taken at the next wake-up.
 const ORDERS: usize = 4096;
+/// How long the control loop waits for a data thread: it takes its orders between two batches.
+const PATIENCE: Duration = Duration::from_secs(1);
 /// Longest sleep.
 const SLEEP_MAX: Duration = Duration::from_millis(100);
 /// Samples of one item sent before the next item gets its turn.
@@ -120,9 +122,9 @@ impl Tx {
         })
     }
 
-    /// Gives an order. Never waits; the error says that the thread is far behind.
+    /// Gives an order. Blocks while the thread is far behind, at most [`PATIENCE`]; then it hangs, which is the error.
     pub(crate) fn order(&self, order: Order) -> anyhow::Result<()> {
-        let sent = self.orders.send(order);
+        let sent = self.orders.send_within(order, PATIENCE);
         self.waker.wake();
         sent.map_err(|_order| anyhow::anyhow!("the sending thread has {ORDERS} orders waiting"))
     }
