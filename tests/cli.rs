@@ -353,27 +353,6 @@ fn a_writer_that_is_gone_leaves_its_value_and_why_says_so() {
 }
 
 #[test]
-fn the_demo_sends_nothing_unread_and_recovers_twice() {
-    let dir = Dir::new();
-
-    let shown = command(&["--json", "demo", "--seconds", "12"])
-        .env("TMPDIR", &dir.0)
-        .output()
-        .unwrap();
-
-    assert_eq!(code(&shown), 0, "{}", text(&shown.stderr));
-    let summary = text(&shown.stdout).lines().last().unwrap().to_owned();
-    let summary: Value = serde_json::from_str(&summary).unwrap();
-    assert_eq!(summary["event"], json!("summary"));
-    assert_eq!(summary["items"], json!(7));
-    assert_eq!(summary["sample_bytes_before_reading"], json!(0));
-    assert!(summary["sample_bytes"].as_u64().unwrap() > 0, "{summary}");
-    assert_eq!(summary["recovered"], json!(true), "{summary}");
-    assert_eq!(fs::read_dir(&dir.0).unwrap().count(), 0);
-    assert_eq!(code(&ddx(&["demo", "--seconds", "3"])), 2);
-}
-
-#[test]
 fn no_daemon_is_an_error_with_a_hint() {
     let dir = Dir::new();
     let socket = dir.0.join("none.sock");

@@ -146,30 +146,18 @@ impl<'a> Show<'a> {
         self.tell(true)
     }
 
-    /// Prints the summary. Returns whether every recovery was complete.
+    /// Prints the summary. Returns whether samples came and every recovery was complete.
     pub(super) fn finish(self) -> anyhow::Result<bool> {
-        let received: u64 = self
-            .items
-            .values()
-            .flatten()
-            .map(Subscription::received)
-            .sum();
-        let missed: u64 = self
-            .items
-            .values()
-            .flatten()
-            .map(Subscription::missed)
-            .sum();
-        let left_out: u64 = self
-            .items
-            .values()
-            .flatten()
-            .map(Subscription::left_out)
-            .sum();
-        let recovered = self
-            .recoveries
-            .iter()
-            .all(|recovery| recovery.took.is_some());
+        let sum =
+            |count: fn(&Subscription) -> u64| self.items.values().flatten().map(count).sum::<u64>();
+        let received = sum(Subscription::received);
+        let missed = sum(Subscription::missed);
+        let left_out = sum(Subscription::left_out);
+        let recovered = received > 0
+            && self
+                .recoveries
+                .iter()
+                .all(|recovery| recovery.took.is_some());
         let samples = self.meter.total();
         if self.out.json {
             let recoveries = self
