@@ -1,6 +1,7 @@
 //! `ddx info`: one item in full.
 
 use ddx_store::{Description, ReaderEntry};
+use ddx_wire::HostName;
 use serde_json::{Value, json};
 
 use super::Context;
@@ -39,13 +40,13 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         context.out.object(&all)?;
         return Ok(Exit::Done);
     }
-    for line in lines(&item) {
+    for line in lines(&item, store.host()) {
         context.out.line(&line)?;
     }
     Ok(Exit::Done)
 }
 
-fn lines(item: &Description) -> Vec<String> {
+fn lines(item: &Description, own: &HostName) -> Vec<String> {
     let entry = &item.entry;
     let written = entry.last_publish.map_or_else(
         || "?".to_owned(),

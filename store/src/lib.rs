@@ -1,4 +1,57 @@
-//! Named typed items in the shared memory of one host.
+//! Named typed items in the shared memory of one host, and in its mirrors of other hosts' items.
+//!
+//! A program opens the [`Store`] of its host's daemon and asks it for a [`Writer`] or a [`Reader`] by name. From then on
+//! samples go through shared memory alone: a write never waits for a reader, a read never touches a socket, and both go
+//! on when the daemon is dead. A reader on another host's item is the subscription: the daemon has it sent, and the
+//! samples appear here.
+//!
+//! ```
+//! use std::time::Duration;
+//!
+//! use ddx_store::server::Config;
+//! use ddx_store::{Item, Store};
+//! use ddx_wire::HostName;
+//!
+//! #[derive(Item, Clone, Copy, Debug, PartialEq)]
+//! #[repr(C)]
+//! struct Pose {
+//!     #[ddx(unit = "m")]
+//!     x: f64,
+//!     #[ddx(unit = "m")]
+//!     y: f64,
+//! }
+//!
+//! # fn main() -> Result<(), ddx_store::Error> {
+//! // A program on a host with a daemon says `Store::open()?`; this one brings its own.
+//! let (store, mut server) = Store::embedded(Config::new(HostName::sanitised("robot1")))?;
+//! let stop = std::sync::atomic::AtomicBool::new(false);
+//! std::thread::scope(|scope| {
+//!     scope.spawn(|| server.run(&stop));
+//!     let mut writer = store.writer::<Pose>("pose")?;
+//!     let mut reader = store.reader::<Pose>("robot1/pose")?;
+//!     writer.write(&Pose { x: 1.0, y: 2.0 })?;
+//!     let sample = reader.next(Duration::from_secs(1))?.expect("it was just written");
+//!     assert_eq!(sample.value, Pose { x: 1.0, y: 2.0 });
+//!     println!("{} old", sample.meta.age(ddx_store::now()));
+//!     stop.store(true, std::sync::atomic::Ordering::Relaxed);
+//!     Ok(())
+//! })
+//! # }
+//! ```
+//!
+//! | to read | call |
+//! |---|---|
+//! | the present value, at once | [`Reader::current`] |
+//! | what is newer than all seen, with a deadline | [`Reader::next`], or [`wait_any`] over many readers |
+//! | what follows a place, with exact counts of what was missed | [`Reader::after`] |
+//! | in place, without a copy | [`Reader::current_pinned`], [`Reader::next_pinned`] |
+//!
+//! What crosses a process is laid out in [`layout`]; the protocol on it is [`ring`]'s, and loom checks it.
+
+/// The examples of the README, which must compile.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+pub struct Readme;
 
 // The memory protocol: public for the models, contract tests and benches, not for applications.
 #[doc(hidden)]

@@ -1,5 +1,6 @@
 //! What a reader is given: values with their origin, ages, and exact counts of what it missed.
 
+use std::fmt;
 use std::time::Duration;
 
 use ddx_wire::{Epoch, Seq, Time};
@@ -122,6 +123,19 @@ impl Meta {
             filtered: self.filtered,
             segment: self.segment,
             pos: self.pos,
+        }
+    }
+}
+
+impl fmt::Display for Age {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.bound {
+            None => f.write_str("?"),
+            Some(0) => write!(f, "{:.1?}", Duration::from_nanos(self.ns)),
+            Some(bound) => {
+                let (age, bound) = (Duration::from_nanos(self.ns), Duration::from_nanos(bound));
+                write!(f, "{age:.1?} ± {bound:.1?}")
+            }
         }
     }
 }
@@ -265,5 +279,13 @@ mod tests {
         );
         sample.bound_ns = Some(u64::MAX);
         assert_eq!(sample.age(Time(50)), Age { ns: 0, bound: None });
+    }
+
+    #[test]
+    fn an_age_reads_as_people_say_it() {
+        let said = |ns, bound| Age { ns, bound }.to_string();
+        assert_eq!(said(51_300_000, Some(498_000)), "51.3ms ± 498.0µs");
+        assert_eq!(said(51_300_000, Some(0)), "51.3ms");
+        assert_eq!(said(0, None), "?");
     }
 }
