@@ -52,10 +52,10 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
         || "?".to_owned(),
         |at| format!("{} ago", span(elapsed_ns(at, ddx_store::now()))),
     );
-    let path = if item.note.is_empty() {
-        "local"
-    } else {
-        &item.note
+    let path = match (item.note.as_str(), entry.host == *own) {
+        ("", true) => "local: no other host reads it",
+        ("", false) => "none: nobody on this host reads it, so nothing is sent",
+        (note, _) => note,
     };
     let mut lines = vec![
         format!("name      {}", entry.name),
