@@ -379,9 +379,13 @@ impl Network {
                 description,
                 schema_text,
             } => {
+                // Two hosts may hold one prefix: the store knows each item by the name that this host shows.
                 let item = RemoteItem {
                     host: self.host_name(host),
-                    description,
+                    description: ItemDescription {
+                        name: name.clone(),
+                        ..description
+                    },
                     schema: schema_text.to_string(),
                 };
                 self.remote.insert(name, item);
