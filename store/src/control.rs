@@ -304,7 +304,7 @@ pub struct ItemEntry {
 pub struct Description {
     /// The line of the listing.
     pub entry: ItemEntry,
-    /// Text of the schema; empty while unknown.
+    /// Text of the schema; empty while unknown, or when another host's is longer than [`SCHEMA_MAX_BYTES`].
     pub schema: String,
     /// Epoch of the present segment, or of the owner's when it is not held here.
     pub epoch: Epoch,

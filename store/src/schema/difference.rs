@@ -128,8 +128,16 @@ fn differs(
     here: impl std::fmt::Display,
     item: impl std::fmt::Display,
 ) -> String {
+    // A type is shown with all its fields, which may be a thousand; the start of it tells two apart.
+    let shown = |side: &dyn std::fmt::Display| -> String {
+        side.to_string().chars().take(SHOWN_MAX_CHARS).collect()
+    };
+    let (here, item) = (shown(&here), shown(&item));
     format!("{}: {what}{here} here, {item} in the item", subject(path))
 }
+
+/// Longest text of a type, unit or range in a difference.
+const SHOWN_MAX_CHARS: usize = 80;
 
 fn subject(path: &str) -> String {
     match path {

@@ -7,10 +7,14 @@ use ddx_wire::{Epoch, HostName, ItemName, SchemaHash};
 
 use super::item::Item;
 use super::{Registry, RemoteItem, parse_schema};
-use crate::control::{Description, ItemEntry, ReaderEntry, Reply};
+use crate::control::{Description, ItemEntry, ReaderEntry, Reply, SCHEMA_MAX_BYTES};
 
 /// Items of one page: with the longest names, programs and schema names a page still fits one message.
 const PAGE: usize = 64;
+/// Longest note on an item's way here. It names the reading hosts, which may be a thousand.
+const NOTE_MAX_BYTES: usize = 4096;
+/// Longest reason for which a reader was refused: with as many readers as are shown it still fits one message.
+const REFUSED_MAX_BYTES: usize = 256;
 
 impl Registry {
     pub(super) fn list(&self, after: &str) -> Reply {
@@ -45,8 +49,11 @@ impl Registry {
         Some(Description {
             schema: match (tenure, remote) {
                 (Some(tenure), _) => tenure.schema.text().to_owned(),
-                (None, Some(remote)) => remote.schema.clone(),
-                (None, None) => String::new(),
+                // A longer one fits no answer, and no program here could read the item.
+                (None, Some(remote)) if remote.schema.len() <= SCHEMA_MAX_BYTES => {
+                    remote.schema.clone()
+                }
+                (None, Some(_) | None) => String::new(),
             },
             epoch: match (tenure, remote) {
                 (Some(tenure), _) => tenure.segment.control.epoch(),
@@ -54,7 +61,10 @@ impl Registry {
                 (None, None) => Epoch::default(),
             },
             published: tenure.map_or(0, |tenure| tenure.segment.control.head_pos()),
-            note: self.notes.get(name).cloned().unwrap_or_default(),
+            note: self
+                .notes
+                .get(name)
+                .map_or_else(String::new, |note| cut(note, NOTE_MAX_BYTES)),
             readers,
             entry,
         })
@@ -70,7 +80,10 @@ impl Registry {
                     pid: client.pid,
                     rate_mhz: reader.contract.max_rate_mhz,
                     bound: reader.seat.is_some(),
-                    refused: reader.refused.clone(),
+                    refused: reader
+                        .refused
+                        .as_deref()
+                        .map(|refused| cut(refused, REFUSED_MAX_BYTES)),
                 })
             })
             .collect()
@@ -135,4 +148,10 @@ fn remote_entry(name: &ItemName, remote: &RemoteItem) -> ItemEntry {
         last_publish: None,
         capacity_bytes: description.capacity_bytes,
     }
+}
+
+/// As much of a text as may be shown.
+fn cut(text: &str, max_bytes: usize) -> String {
+    let (shown, _) = text.split_at(text.floor_char_boundary(max_bytes));
+    shown.to_owned()
 }

@@ -1,7 +1,9 @@
 //! The registry without sockets: messages in, effects out.
 
+use ddx_wire::{SchemaHash, WriterState};
+
 use super::*;
-use crate::control::Purpose;
+use crate::control::{MESSAGE_MAX_BYTES, Purpose};
 use crate::segment::{SegmentFds, SegmentWriter, Spec};
 
 struct Bench {
@@ -184,5 +186,78 @@ fn any_bytes_are_an_answer_or_the_end_of_the_connection() {
         let told = std::iter::from_fn(|| bench.registry.poll_effect()).count();
         assert!(told > 0, "{first} was ignored");
         bench.registry.disconnect(client);
+    }
+}
+
+#[test]
+fn a_description_fits_one_message_whatever_others_have_said() {
+    let mut bench = Bench::new(Quotas::default());
+    let (writer, reader) = (bench.client(), bench.client());
+    let nested = |innermost: &str| {
+        let depth = 14;
+        let open = format!("{}: struct {{ ", "f".repeat(120)).repeat(depth);
+        let close = " }".repeat(depth);
+        format!("schema P bincode struct {{ {open}x: {innermost}{close} }}")
+    };
+    for handle in 0..64 {
+        let request = Request::OpenReader {
+            handle,
+            name: "n".to_owned(),
+            schema: Some(nested("u16")),
+            pins: 0,
+            rate_mhz: None,
+            held: None,
+        };
+        assert!(matches!(
+            bench.ask(reader, request, vec![]),
+            Reply::Reader { .. }
+        ));
+    }
+    let lease = Request::OpenWriter {
+        handle: 1,
+        name: "n".to_owned(),
+        schema: nested("u8"),
+        purpose: Purpose::Write,
+    };
+    let epoch = epoch_of(&bench.ask(writer, lease, vec![]));
+    assert_eq!(bench.commit(writer, 1, epoch), Reply::Done);
+    let far = ItemName::parse("base/x", &HostName::parse("host").unwrap()).unwrap();
+    bench
+        .registry
+        .set_notes([(far.clone(), "é".repeat(40_000))].into());
+    bench.registry.set_remote(vec![RemoteItem {
+        host: HostName::parse("base").unwrap(),
+        description: ItemDescription {
+            name: far,
+            schema_hash: SchemaHash::default(),
+            capacity_bytes: 8,
+            epoch: Epoch(1),
+            writer: WriterState::Live,
+            program: "p".to_owned(),
+        },
+        schema: Schema::raw("far", "json", &"x".repeat(60_000))
+            .unwrap()
+            .text()
+            .to_owned(),
+    }]);
+
+    for (name, refused) in [("n", 64), ("base/x", 0)] {
+        let request = Request::Describe {
+            name: name.to_owned(),
+        };
+        let reply = bench.ask(writer, request, vec![]);
+        let Reply::Description(description) = &reply else {
+            panic!("{reply:?}");
+        };
+        let readers = &description.readers;
+        assert_eq!(
+            readers
+                .iter()
+                .filter(|reader| reader.refused.is_some())
+                .count(),
+            refused
+        );
+        let len = ToClient::Reply { serial: 1, reply }.encode().unwrap().len();
+        assert!(len <= MESSAGE_MAX_BYTES, "`{name}`: {len} bytes");
     }
 }
