@@ -80,6 +80,31 @@ fn forged_and_replayed_datagrams_are_counted_and_the_true_ones_arrive() {
     });
 }
 
+#[test]
+fn two_hosts_with_one_prefix_are_both_listed_and_read() {
+    let first = Daemon::start("robot1", Some('1'), &[]);
+    let join = format!("udp/{}", first.control());
+    let second = Daemon::start("robot1", Some('1'), &["--join", &join]);
+    let base = Daemon::start("base", Some('1'), &["--join", &join]);
+    for (daemon, value) in [(&first, "1"), (&second, "2")] {
+        let put = daemon.ddx(&["put", "n", value, "--type", "u64"]);
+        assert_eq!(code(&put), 0, "{}", text(&put.stderr));
+    }
+    let id = second.item("@/self")["id"].as_str().unwrap().to_owned();
+    let other = format!("robot1~{}/n", &id[..4]);
+
+    base.wait_until("both items are listed", |daemon| {
+        let listed = daemon.ddx(&["ls"]);
+        let listed = text(&listed.stdout);
+        listed.contains("robot1/n") && listed.contains(&other)
+    });
+
+    // Who came first keeps the prefix, and its own names are what each host says.
+    assert_eq!(base.item("robot1/n"), 1);
+    assert_eq!(base.item(&other), 2);
+    assert_eq!(second.item("n"), 2);
+}
+
 /// Passes datagrams between two hosts, each once damaged, once whole and once again, until the test's process ends.
 fn relay(socket: &UdpSocket, a: SocketAddr, b: SocketAddr) {
     let mut buffer = [0; 2048];
