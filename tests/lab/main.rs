@@ -1,0 +1,21 @@
+//! What the real daemon does on the real kernel: hosts on one switch that counts, cuts and loses, and the scenarios in
+//! which what was promised must hold.
+//!
+//! | file | what must hold |
+//! |---|---|
+//! | `interest.rs` | nothing is sent until somebody reads, then once, and no longer than somebody reads |
+//! | `hosts.rs` | hosts join, leave, die, are cut off, and come back; a host without a network is whole |
+//! | `load.rs` | the books balance under load, and the last value arrives under loss |
+//! | `why.rs` | `ddx why` names the cause |
+
+#![expect(
+    clippy::unwrap_used,
+    reason = "a helper of a test fails the test, as the test itself would"
+)]
+
+mod hosts;
+mod interest;
+mod load;
+mod program;
+mod site;
+mod why;
