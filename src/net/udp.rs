@@ -10,6 +10,14 @@ const RECEIVE_BATCH: usize = 16;
 /// Largest run of datagrams that GRO joins.
 const BUFFER_BYTES: usize = 65_536;
 
+/// What one call took.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Batch {
+    pub(crate) datagrams: usize,
+    /// Every buffer was filled, so that more may be waiting.
+    pub(crate) full: bool,
+}
+
 /// A UDP socket with offloads, for one thread.
 pub(crate) struct Channel {
     socket: UdpSocket,
@@ -50,11 +58,11 @@ impl Channel {
         self.state.max_gso_segments()
     }
 
-    /// Takes what has arrived, without waiting, and hands over datagram after datagram. Returns how many there were.
+    /// Takes what has arrived, without waiting, and hands over datagram after datagram.
     pub(crate) fn receive(
         &mut self,
         mut each: impl FnMut(SocketAddr, &mut [u8]),
-    ) -> io::Result<usize> {
+    ) -> io::Result<Batch> {
         self.buffers.resize(BUFFER_BYTES * RECEIVE_BATCH, 0);
         let mut metas = [RecvMeta::default(); RECEIVE_BATCH];
         let mut chunks = self.buffers.chunks_exact_mut(BUFFER_BYTES);
@@ -66,11 +74,11 @@ impl Channel {
                 .recv(UdpSockRef::from(&self.socket), &mut slices, &mut metas)
             {
                 Ok(filled) => filled,
-                Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(0),
+                Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(Batch::default()),
                 Err(e) => return Err(e),
             }
         };
-        let mut count = 0;
+        let mut datagrams = 0;
         for (meta, buffer) in metas
             .iter()
             .zip(self.buffers.chunks_exact_mut(BUFFER_BYTES))
@@ -81,9 +89,12 @@ impl Channel {
             };
             for datagram in run.chunks_mut(meta.stride.max(1)) {
                 each(meta.addr, datagram);
-                count += 1;
+                datagrams += 1;
             }
         }
-        Ok(count)
+        Ok(Batch {
+            datagrams,
+            full: filled == RECEIVE_BATCH,
+        })
     }
 }

@@ -90,7 +90,9 @@ impl WaitSet {
 
     /// A handle that ends the sleep.
     pub fn waker(&self) -> Waker {
-        Waker { connection: Arc::clone(&self.connection) }
+        Waker {
+            connection: Arc::clone(&self.connection),
+        }
     }
 
     /// Blocks until some reader may have something new, at most `timeout`, or until woken, and puts those into `rung`. Never
@@ -133,7 +135,10 @@ impl WaitSet {
         let keys: Vec<WaitKey> = self.members.keys().copied().collect();
         for key in keys {
             self.listen(key);
-            let ready = self.members.get_mut(&key).is_some_and(|m| !matches!(m.reader.readiness(), Ok(Readiness::Waiting)));
+            let ready = self
+                .members
+                .get_mut(&key)
+                .is_some_and(|m| !matches!(m.reader.readiness(), Ok(Readiness::Waiting)));
             if ready && !rung.contains(&key) {
                 rung.push(key);
             }
@@ -142,7 +147,9 @@ impl WaitSet {
 
     /// Has the bell rung for the segment that the reader is bound to now, which a hand-over changes.
     fn listen(&mut self, key: WaitKey) {
-        let Some(member) = self.members.get_mut(&key) else { return };
+        let Some(member) = self.members.get_mut(&key) else {
+            return;
+        };
         let bell = member.reader.bell_bit();
         if bell == member.bell {
             return;
@@ -173,6 +180,9 @@ impl Waker {
     /// Ends the present or the next sleep.
     pub fn wake(&self) {
         let (bells, client) = self.connection.bell();
-        bells.ring(Bell { client, bit: WAKER_BIT });
+        bells.ring(Bell {
+            client,
+            bit: WAKER_BIT,
+        });
     }
 }

@@ -97,16 +97,20 @@ impl<T: Item> Writer<T> {
     /// Publishes `value` as captured now. Never blocks, and makes no system call while no reader waits. Fails when the
     /// value is longer than the item's capacity.
     pub fn write(&mut self, value: &T) -> Result<Seq, Error> {
-        self.write_at(value, clock::now())
+        self.fill(value)?.publish()
     }
 
     /// Publishes `value`, whose content was true at `capture`.
     pub fn write_at(&mut self, value: &T, capture: Time) -> Result<Seq, Error> {
+        self.fill(value)?.publish_at(capture)
+    }
+
+    fn fill(&mut self, value: &T) -> Result<RawLoan<'_>, Error> {
         self.payload.clear();
         value.encode(&mut self.payload)?;
         let mut loan = self.raw.loan(self.payload.len())?;
         loan.as_mut_slice().copy_from_slice(&self.payload);
-        loan.publish_at(capture)
+        Ok(loan)
     }
 
     /// The item's name.
@@ -313,14 +317,14 @@ impl RawWriter {
         }
     }
 
-    fn next_origin(&mut self, capture: Time) -> Origin {
+    fn next_origin(&mut self, capture: Time, publish: Time) -> Origin {
         self.seq = Seq(self.seq.0 + 1);
         Origin {
             epoch: self.segment.epoch(),
             seq: self.seq,
             filtered: 0,
             capture,
-            publish: clock::now(),
+            publish,
             receive: None,
             bound_ns: None,
         }
@@ -368,13 +372,19 @@ impl RawLoan<'_> {
 
     /// Publishes the sample as captured now.
     pub fn publish(self) -> Result<Seq, Error> {
-        self.publish_at(clock::now())
+        // Read once: the clock is half of what a write of a few bytes costs.
+        let now = clock::now();
+        self.publish_between(now, now)
     }
 
     /// Publishes the sample, whose content was true at `capture`.
     pub fn publish_at(self, capture: Time) -> Result<Seq, Error> {
+        self.publish_between(capture, clock::now())
+    }
+
+    fn publish_between(self, capture: Time, publish: Time) -> Result<Seq, Error> {
         self.writer.lease.connection.check_fork()?;
-        let origin = self.writer.next_origin(capture);
+        let origin = self.writer.next_origin(capture, publish);
         Ok(self.publish_with(&origin))
     }
 

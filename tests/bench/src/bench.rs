@@ -4,7 +4,7 @@ use anyhow::Result;
 
 use crate::programs::Programs;
 use crate::table::Table;
-use crate::{local, network};
+use crate::{cost, local, network};
 
 /// A run of the bench.
 pub(crate) struct Bench {
@@ -25,8 +25,8 @@ pub(crate) const LINES: &[Line] = &[
     ("wake", local::wake),
     ("poll", local::poll),
     ("large", local::large),
-    ("readers", local::readers),
-    ("memory", local::memory),
+    ("readers", cost::readers),
+    ("memory", cost::memory),
     ("hosts", network::hosts),
     ("spin", network::spin),
     ("idle", network::idle),

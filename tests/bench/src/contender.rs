@@ -35,7 +35,9 @@ pub(crate) struct Pins<const N: usize> {
 impl Copies {
     /// Opens the writer of `name`.
     pub(crate) fn open(store: &Store, name: &str) -> Result<Self> {
-        let writer = store.writer(name).with_context(|| format!("opening the writer of `{name}`"))?;
+        let writer = store
+            .writer(name)
+            .with_context(|| format!("opening the writer of `{name}`"))?;
         Ok(Self { writer })
     }
 
@@ -49,7 +51,9 @@ impl Copies {
 impl CopiesReader {
     /// Opens a reader of `name`.
     pub(crate) fn open(store: &Store, name: &str, blocks: bool) -> Result<Self> {
-        let reader = store.reader(name).with_context(|| format!("opening a reader of `{name}`"))?;
+        let reader = store
+            .reader(name)
+            .with_context(|| format!("opening a reader of `{name}`"))?;
         Ok(Self { reader, blocks })
     }
 
@@ -61,28 +65,82 @@ impl CopiesReader {
 }
 
 /// Both sides of a conversation by copies, each with a connection of its own as two programs would have.
-pub(crate) fn copies(stores: &[Store; 2], name: &str, blocks: bool) -> Result<[Side<Copies, CopiesReader>; 2]> {
+pub(crate) fn copies(
+    stores: &[Store; 2],
+    name: &str,
+    blocks: bool,
+) -> Result<[Side<Copies, CopiesReader>; 2]> {
     let [near, far] = stores;
     let (there, back) = (format!("{name}-there"), format!("{name}-back"));
     let (to_far, to_near) = (Copies::open(near, &there)?, Copies::open(far, &back)?);
     Ok([
-        Side { to: to_far, from: CopiesReader::open(near, &back, blocks)? },
-        Side { to: to_near, from: CopiesReader::open(far, &there, blocks)? },
+        Side {
+            to: to_far,
+            from: CopiesReader::open(near, &back, blocks)?,
+        },
+        Side {
+            to: to_near,
+            from: CopiesReader::open(far, &there, blocks)?,
+        },
     ])
 }
 
 /// Both sides of a conversation by values that stay where they are.
-pub(crate) fn loans<const N: usize>(stores: &[Store; 2], name: &str) -> Result<[Side<Loans<N>, Pins<N>>; 2]> {
+pub(crate) fn loans<const N: usize>(
+    stores: &[Store; 2],
+    name: &str,
+) -> Result<[Side<Loans<N>, Pins<N>>; 2]> {
     // Slots are reserved for each possible reader: two for large values, so that the item stays within the quota.
-    let options = WriterOptions { depth: 4, pins: 0, max_readers: 2, capacity_bytes: None };
+    let options = WriterOptions {
+        depth: 4,
+        pins: 0,
+        max_readers: 2,
+        capacity_bytes: None,
+    };
     let [near, far] = stores;
     let (there, back) = (format!("{name}-there"), format!("{name}-back"));
-    let to_far = Loans { writer: near.writer_with(&there, options)? };
-    let to_near = Loans { writer: far.writer_with(&back, options)? };
+    let to_far = Loans {
+        writer: near.writer_with(&there, options)?,
+    };
+    let to_near = Loans {
+        writer: far.writer_with(&back, options)?,
+    };
     Ok([
-        Side { to: to_far, from: Pins { reader: near.reader_with(&back, ReaderOptions::default())? } },
-        Side { to: to_near, from: Pins { reader: far.reader_with(&there, ReaderOptions::default())? } },
+        Side {
+            to: to_far,
+            from: Pins {
+                reader: near.reader_with(&back, ReaderOptions::default())?,
+            },
+        },
+        Side {
+            to: to_near,
+            from: Pins {
+                reader: far.reader_with(&there, ReaderOptions::default())?,
+            },
+        },
     ])
+}
+
+impl<S, T> Side<S, T> {
+    /// The same, lent for a while.
+    pub(crate) fn lend(&mut self) -> Side<&mut S, &mut T> {
+        Side {
+            to: &mut self.to,
+            from: &mut self.from,
+        }
+    }
+}
+
+impl<S: Send64> Send64 for &mut S {
+    fn send(&mut self, stamp: u64) -> Result<()> {
+        (**self).send(stamp)
+    }
+}
+
+impl<T: Take64> Take64 for &mut T {
+    fn take(&mut self) -> Result<u64> {
+        (**self).take()
+    }
 }
 
 impl Send64 for Copies {
@@ -94,7 +152,11 @@ impl Send64 for Copies {
 impl Take64 for CopiesReader {
     fn take(&mut self) -> Result<u64> {
         loop {
-            let timeout = if self.blocks { PATIENCE } else { Duration::ZERO };
+            let timeout = if self.blocks {
+                PATIENCE
+            } else {
+                Duration::ZERO
+            };
             match self.reader.next(timeout)? {
                 Some(sample) => return Ok(sample.value[0]),
                 None if self.blocks => bail!("no value within {PATIENCE:?}"),
@@ -115,7 +177,10 @@ impl<const N: usize> Send64 for Loans<N> {
 
 impl<const N: usize> Take64 for Pins<N> {
     fn take(&mut self) -> Result<u64> {
-        let guard = self.reader.next_pinned(PATIENCE)?.context("no value in time")?;
+        let guard = self
+            .reader
+            .next_pinned(PATIENCE)?
+            .context("no value in time")?;
         Ok(guard[0])
     }
 }

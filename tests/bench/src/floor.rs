@@ -70,7 +70,10 @@ impl Shared {
         Self::over(file.as_fd())
     }
 
-    #[expect(unsafe_code, reason = "shared memory has no safe door in the standard library")]
+    #[expect(
+        unsafe_code,
+        reason = "shared memory has no safe door in the standard library"
+    )]
     fn over(file: BorrowedFd<'_>) -> Result<Self> {
         ftruncate(file, u64::try_from(size_of::<Cell>())?).context("sizing shared memory")?;
         // SAFETY: a new mapping at an address of the kernel's choice; nothing else is there.
@@ -98,14 +101,19 @@ impl Shared {
         let seq = self.cell.seq.load(Ordering::Acquire);
         let value = std::array::from_fn(|word| self.cell.words[word].load(Ordering::Relaxed));
         fence(Ordering::Acquire);
-        (seq.is_multiple_of(2) && self.cell.seq.load(Ordering::Relaxed) == seq).then_some((seq, value))
+        (seq.is_multiple_of(2) && self.cell.seq.load(Ordering::Relaxed) == seq)
+            .then_some((seq, value))
     }
 }
 
 impl FloorWriter {
     /// Writes the value and wakes who waits.
     pub(crate) fn write(&mut self, value: &[u64; WORDS]) -> Result<()> {
-        let Cell { seq, waiting, words } = self.0.cell;
+        let Cell {
+            seq,
+            waiting,
+            words,
+        } = self.0.cell;
         let before = seq.load(Ordering::Relaxed);
         seq.store(before.wrapping_add(1), Ordering::Relaxed);
         fence(Ordering::Release);
@@ -127,7 +135,11 @@ impl FloorReader {
     /// A reader that has seen what is there. It sleeps for news if it `blocks`, else it polls.
     pub(crate) fn new(shared: Shared, blocks: bool) -> Self {
         let seen = shared.cell.seq.load(Ordering::Acquire);
-        Self { shared, seen, blocks }
+        Self {
+            shared,
+            seen,
+            blocks,
+        }
     }
 
     /// The next value.

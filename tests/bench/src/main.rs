@@ -3,7 +3,11 @@
 //! The figures are medians over rounds in which all contenders take turns; a ratio is the median over the rounds of the ratios
 //! of pairs. Nothing here fails because a machine is slow.
 
-#![expect(clippy::print_stdout, clippy::print_stderr, reason = "its figures are what a benchmark is for")]
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "its figures are what a benchmark is for"
+)]
 
 use std::process::ExitCode;
 
@@ -17,6 +21,7 @@ use crate::table::Table;
 
 mod bench;
 mod contender;
+mod cost;
 mod floor;
 mod local;
 mod network;
@@ -71,11 +76,19 @@ fn main() -> ExitCode {
 }
 
 fn run(args: &Run) -> Result<()> {
-    if let Some(unknown) = args.lines.iter().find(|name| LINES.iter().all(|(line, _)| line != name)) {
+    if let Some(unknown) = args
+        .lines
+        .iter()
+        .find(|name| LINES.iter().all(|(line, _)| line != name))
+    {
         let known: Vec<_> = LINES.iter().map(|(line, _)| *line).collect();
         bail!("no line `{unknown}`\nhint: there are {}", known.join(", "));
     }
-    let mut bench = Bench { smoke: args.smoke, programs: Programs::build(!args.smoke)?, table: Table::default() };
+    let mut bench = Bench {
+        smoke: args.smoke,
+        programs: Programs::find(!args.smoke)?,
+        table: Table::default(),
+    };
     for (name, measure) in LINES {
         if args.lines.is_empty() || args.lines.iter().any(|line| line == name) {
             eprintln!("measuring: {name}");

@@ -33,32 +33,39 @@ pub(crate) fn spin(bench: &mut Bench) -> Result<()> {
 }
 
 fn between_hosts(bench: &mut Bench, what: &str, spin: bool, budget: &'static str) -> Result<()> {
-    let Some(lab) = lab::require(&["a", "b"]) else { return Ok(()) };
+    let Some(lab) = lab::require(&["a", "b"]) else {
+        return Ok(());
+    };
     let _daemons = start_daemons(&lab, &bench.programs, spin)?;
     let count = bench.scale(300, 2_000).to_string();
     let (a, b) = (lab.host("a"), lab.host("b"));
     let programs = &bench.programs;
-    let sink = |way: &[&str]| -> Result<Vec<f64>> {
-        let sink = play(b, programs, &[&["sink", &count], way].concat())?;
+    // The sink comes first: a datagram to a port that nobody has bound comes back to its source as an error.
+    let flow = |from: &[&str], to: &[&str]| -> Result<Vec<f64>> {
+        let sink = play(b, programs, &[&["sink", &count], to].concat())?;
+        sink.wait_line(|line| line == "ready", PATIENCE)?;
+        let _source = play(a, programs, &[&["source"], from].concat())?;
         sink.wait_line(|line| line == "end", PATIENCE)?;
         Ok(p50_p99(figures(&sink.output())))
     };
-    let mut ours = || {
-        let _source = play(a, programs, &["source", "ddx", "stamp"])?;
-        sink(&["ddx", "a/stamp"])
-    };
+    let mut ours = || flow(&["ddx", "stamp"], &["ddx", "a/stamp"]);
     let mut relay = || {
         let relay_in = play(b, programs, &["relay-in", &RELAY_PORT.to_string(), SHARED])?;
         relay_in.wait_line(|line| line == "ready", PATIENCE)?;
-        let _relay_out = play(a, programs, &["relay-out", SHARED, &format!("{}:{RELAY_PORT}", b.address())])?;
-        let _source = play(a, programs, &["source", "futex", SHARED])?;
-        sink(&["futex", SHARED])
+        let _relay_out = play(
+            a,
+            programs,
+            &[
+                "relay-out",
+                SHARED,
+                &format!("{}:{RELAY_PORT}", b.address()),
+            ],
+        )?;
+        flow(&["futex", SHARED], &["futex", SHARED])
     };
     let mut udp = || {
         let at = format!("{}:{UDP_PORT}", b.address());
-        // Until the sink is bound, its host answers that nobody is there, which a connected sender hears as an error.
-        let _source = play(a, programs, &["source", "udp", &at])?;
-        sink(&["udp", &at])
+        flow(&["udp", &at], &["udp", &at])
     };
     let rounds = bench.scale(1, 5);
     let contest = Contest::run(rounds, &mut [&mut ours, &mut relay, &mut udp])?;
@@ -77,12 +84,20 @@ fn between_hosts(bench: &mut Bench, what: &str, spin: bool, budget: &'static str
 
 /// `idle`: what hosts say to one another while nobody reads on another host.
 pub(crate) fn idle(bench: &mut Bench) -> Result<()> {
-    let names: Vec<String> = (0..bench.scale(3, 10)).map(|host| format!("h{host}")).collect();
+    let names: Vec<String> = (0..bench.scale(3, 10))
+        .map(|host| format!("h{host}"))
+        .collect();
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     for hosts in [&names[..2], &names[..]] {
-        let Some(lab) = lab::require(hosts) else { return Ok(()) };
+        let Some(lab) = lab::require(hosts) else {
+            return Ok(());
+        };
         let _daemons = start_daemons(&lab, &bench.programs, false)?;
-        let items = play(lab.host("h0"), &bench.programs, &["items", &ITEMS.to_string()])?;
+        let items = play(
+            lab.host("h0"),
+            &bench.programs,
+            &["items", &ITEMS.to_string()],
+        )?;
         items.wait_line(|line| line == "ready", PATIENCE)?;
         // Until all know all; what is measured then is what never ends.
         thread::sleep(bench.scale(Duration::from_secs(1), Duration::from_secs(10)));
@@ -90,10 +105,15 @@ pub(crate) fn idle(bench: &mut Bench) -> Result<()> {
         let span = bench.scale(Duration::from_secs(1), Duration::from_secs(10));
         thread::sleep(span);
         let sent = lab.counters()?.since(&before);
-        let each = hosts.iter().map(|host| sent.link(host).from.bytes as f64 / span.as_secs_f64());
+        let each = hosts
+            .iter()
+            .map(|host| sent.link(host).from.bytes as f64 / span.as_secs_f64());
         let mean = each.sum::<f64>() / hosts.len() as f64;
         bench.table.push(Row {
-            what: format!("idle, {ITEMS} items on one of {} hosts, each host sends", hosts.len()),
+            what: format!(
+                "idle, {ITEMS} items on one of {} hosts, each host sends",
+                hosts.len()
+            ),
             unit: "B/s",
             ddx: mean,
             floor: None,
@@ -108,7 +128,9 @@ pub(crate) fn idle(bench: &mut Bench) -> Result<()> {
 pub(crate) fn cold(bench: &mut Bench) -> Result<()> {
     let mut firsts = Vec::new();
     for _ in 0..bench.scale(1, 9) {
-        let Some(lab) = lab::require(&["a", "b"]) else { return Ok(()) };
+        let Some(lab) = lab::require(&["a", "b"]) else {
+            return Ok(());
+        };
         let (a, b) = (lab.host("a"), lab.host("b"));
         give_key(&lab, &bench.programs)?;
         let mut programs = Vec::new();
@@ -156,7 +178,9 @@ fn start_daemons(lab: &Lab, programs: &Programs, spin: bool) -> Result<Vec<Proce
 
 fn start_daemon(host: Host<'_>, programs: &Programs, spin: bool) -> Result<Process> {
     let mut command = Command::new(&programs.ddx);
-    command.args(["up", "--key", KEY]).env("DDX_SPIN", if spin { "true" } else { "false" });
+    command
+        .args(["up", "--key", KEY])
+        .env("DDX_SPIN", if spin { "true" } else { "false" });
     Ok(host.spawn(&command)?)
 }
 

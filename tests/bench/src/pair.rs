@@ -26,25 +26,6 @@ pub(crate) struct Side<S, T> {
     pub(crate) from: T,
 }
 
-impl<S, T> Side<S, T> {
-    /// The same, lent for a while.
-    pub(crate) fn lend(&mut self) -> Result<Side<&mut S, &mut T>> {
-        Ok(Side { to: &mut self.to, from: &mut self.from })
-    }
-}
-
-impl<S: Send64> Send64 for &mut S {
-    fn send(&mut self, stamp: u64) -> Result<()> {
-        (**self).send(stamp)
-    }
-}
-
-impl<T: Take64> Take64 for &mut T {
-    fn take(&mut self) -> Result<u64> {
-        (**self).take()
-    }
-}
-
 /// Where the two sides run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Cores {
@@ -83,8 +64,12 @@ pub(crate) fn ping_pong<S: Send64, T: Take64>(
             }
             anyhow::Ok(())
         });
-        asking.join().map_err(|_panic| anyhow!("the asking thread panicked"))??;
-        answering.join().map_err(|_panic| anyhow!("the answering thread panicked"))?
+        asking
+            .join()
+            .map_err(|_panic| anyhow!("the asking thread panicked"))??;
+        answering
+            .join()
+            .map_err(|_panic| anyhow!("the answering thread panicked"))?
     })
 }
 
@@ -105,7 +90,10 @@ pub(crate) fn now_ns() -> u64 {
 }
 
 fn span(at: Timespec) -> Duration {
-    Duration::new(u64::try_from(at.tv_sec).unwrap_or(0), u32::try_from(at.tv_nsec).unwrap_or(0))
+    Duration::new(
+        u64::try_from(at.tv_sec).unwrap_or(0),
+        u32::try_from(at.tv_nsec).unwrap_or(0),
+    )
 }
 
 fn pin(core: usize) -> Result<()> {

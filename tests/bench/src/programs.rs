@@ -23,22 +23,34 @@ pub(crate) struct Daemon {
 }
 
 impl Programs {
-    /// Builds `ddx`, and the peers where `with_peers` asks for it, beside this program.
-    pub(crate) fn build(with_peers: bool) -> Result<Self> {
+    /// Finds `ddx` beside this program, and builds the peers where `with_peers` asks for it.
+    pub(crate) fn find(with_peers: bool) -> Result<Self> {
         let own = std::env::current_exe().context("finding this program")?;
-        let target = own.ancestors().nth(2).context("this program lies in no target directory")?;
-        let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../Cargo.toml");
-        cargo(&manifest, target)?;
+        let target = own
+            .ancestors()
+            .nth(2)
+            .context("this program lies in no target directory")?;
+        let ddx = own.with_file_name("ddx");
+        if !ddx.exists() {
+            bail!(
+                "`{}` is missing\nhint: cargo build --release --workspace",
+                ddx.display()
+            );
+        }
         let peers_target = target.join("peers");
         let peers = peers_target.join("release/ddx-bench-peers");
-        let peers_manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers/Cargo.toml");
-        if with_peers && let Err(error) = cargo(&peers_manifest, &peers_target) {
-            eprintln!("!!!! NO PEER: iceoryx2 cannot be built here, its columns stay empty: {error:#}");
+        let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("peers/Cargo.toml");
+        if with_peers && let Err(error) = cargo(&manifest, &peers_target) {
+            eprintln!(
+                "!!!! NO PEER: iceoryx2 cannot be built here, its columns stay empty: {error:#}"
+            );
         } else if !peers.exists() {
-            eprintln!("!!!! NO PEER: iceoryx2 is not built, its columns stay empty (a run without --smoke builds it)");
+            eprintln!(
+                "!!!! NO PEER: iceoryx2 is not built, its columns stay empty (a run without --smoke builds it)"
+            );
         }
         Ok(Self {
-            ddx: target.join("release/ddx"),
+            ddx,
             own,
             peers: Some(peers).filter(|path| path.exists()),
         })
@@ -52,9 +64,15 @@ impl Programs {
     /// What the peer measured: the figures that it prints, one a line.
     pub(crate) fn peer<T: std::str::FromStr>(&self, arguments: &[&str]) -> Result<Vec<T>> {
         let peers = self.peers.as_ref().context("no peer is built")?;
-        let output = Command::new(peers).args(arguments).output().context("starting the peer")?;
+        let output = Command::new(peers)
+            .args(arguments)
+            .output()
+            .context("starting the peer")?;
         if !output.status.success() {
-            bail!("the peer failed at {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+            bail!(
+                "the peer failed at {arguments:?}: {}",
+                String::from_utf8_lossy(&output.stderr)
+            );
         }
         Ok(figures(&String::from_utf8_lossy(&output.stdout)))
     }
@@ -62,7 +80,10 @@ impl Programs {
 
 /// The figures among the lines of a program's output.
 pub(crate) fn figures<T: std::str::FromStr>(output: &str) -> Vec<T> {
-    output.lines().filter_map(|line| line.parse().ok()).collect()
+    output
+        .lines()
+        .filter_map(|line| line.parse().ok())
+        .collect()
 }
 
 impl Daemon {
@@ -88,7 +109,10 @@ impl Daemon {
 
     /// A connection to it.
     pub(crate) fn store(&self) -> Result<Store> {
-        Store::options().socket(self.socket()).open().context("opening the store")
+        Store::options()
+            .socket(self.socket())
+            .open()
+            .context("opening the store")
     }
 
     /// Its process.
@@ -108,7 +132,15 @@ impl Drop for Daemon {
 
 fn cargo(manifest: &Path, target: &Path) -> Result<()> {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    command.args(["build", "--release", "--locked", "--quiet", "--manifest-path"]).arg(manifest);
+    command
+        .args([
+            "build",
+            "--release",
+            "--locked",
+            "--quiet",
+            "--manifest-path",
+        ])
+        .arg(manifest);
     command.arg("--target-dir").arg(target);
     let status = command.status().context("starting cargo")?;
     if !status.success() {

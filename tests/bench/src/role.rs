@@ -109,6 +109,7 @@ fn source(mut sender: Box<dyn Send64>) -> Result<()> {
 }
 
 fn sink(count: usize, mut taker: Box<dyn Take64>) -> Result<()> {
+    println!("ready");
     for _ in 0..WARM_UP {
         taker.take()?;
     }
@@ -141,7 +142,9 @@ fn first(name: &str) -> Result<()> {
     let store = Store::open()?;
     let opened = Instant::now();
     let mut reader: Reader<[u64; WORDS]> = store.reader(name)?;
-    reader.next(Duration::from_secs(20))?.context("no value within 20 s")?;
+    reader
+        .next(Duration::from_secs(20))?
+        .context("no value within 20 s")?;
     println!("{}", opened.elapsed().as_nanos());
     Ok(())
 }
@@ -189,9 +192,14 @@ fn relay_in(port: u16, shared: Shared) -> Result<()> {
     println!("ready");
     loop {
         let len = socket.recv(&mut datagram)?;
-        let (head, sealed) = datagram[..len].split_first_chunk_mut::<COUNTER>().context("a counter")?;
+        let (head, sealed) = datagram[..len]
+            .split_first_chunk_mut::<COUNTER>()
+            .context("a counter")?;
         let counter = u64::from_le_bytes(*head);
-        let opened = key.open_in_place(nonce(counter), Aad::from(&*head), sealed).ok().context("opening")?;
+        let opened = key
+            .open_in_place(nonce(counter), Aad::from(&*head), sealed)
+            .ok()
+            .context("opening")?;
         let mut value = [0; WORDS];
         for (word, bytes) in value.iter_mut().zip(opened.chunks_exact(8)) {
             *word = u64::from_le_bytes(*bytes.first_chunk().context("a word")?);
@@ -202,7 +210,11 @@ fn relay_in(port: u16, shared: Shared) -> Result<()> {
 
 /// Any key will do: the floor is what sealing costs.
 fn key() -> Result<LessSafeKey> {
-    Ok(LessSafeKey::new(UnboundKey::new(&AES_256_GCM, &[7; 32]).ok().context("making a key")?))
+    Ok(LessSafeKey::new(
+        UnboundKey::new(&AES_256_GCM, &[7; 32])
+            .ok()
+            .context("making a key")?,
+    ))
 }
 
 fn nonce(counter: u64) -> Nonce {

@@ -15,7 +15,10 @@ impl Contest {
     pub(crate) fn run(rounds: usize, contenders: &mut [Turn<'_>]) -> Result<Self> {
         let mut contest = Self { rounds: Vec::new() };
         for _ in 0..rounds {
-            let round = contenders.iter_mut().map(|turn| turn()).collect::<Result<_>>()?;
+            let round = contenders
+                .iter_mut()
+                .map(|turn| turn())
+                .collect::<Result<_>>()?;
             contest.rounds.push(round);
         }
         Ok(contest)
@@ -28,7 +31,11 @@ impl Contest {
 
     /// Median over the rounds of the ratio of the first contender to another, each pair from one round.
     pub(crate) fn ratio(&self, other: usize, figure: usize) -> f64 {
-        median(self.rounds.iter().map(|round| round[0][figure] / round[other][figure]))
+        median(
+            self.rounds
+                .iter()
+                .map(|round| round[0][figure] / round[other][figure]),
+        )
     }
 }
 
@@ -37,7 +44,11 @@ pub(crate) fn p50_p99(mut latencies: Vec<u64>) -> Vec<f64> {
     latencies.drain(..latencies.len() / 10);
     latencies.sort_unstable();
     [50, 99]
-        .map(|percent| latencies.get(latencies.len() * percent / 100).map_or(f64::NAN, |&ns| ns as f64))
+        .map(|percent| {
+            latencies
+                .get(latencies.len() * percent / 100)
+                .map_or(f64::NAN, |&ns| ns as f64)
+        })
         .to_vec()
 }
 
@@ -58,10 +69,9 @@ mod tests {
 
         let contest = Contest::run(
             3,
-            &mut [
-                &mut || Ok(ours.by_ref().take(1).collect()),
-                &mut || Ok(theirs.by_ref().take(1).collect()),
-            ],
+            &mut [&mut || Ok(ours.by_ref().take(1).collect()), &mut || {
+                Ok(theirs.by_ref().take(1).collect())
+            }],
         )
         .unwrap();
 

@@ -76,7 +76,9 @@ impl Table {
     /// The table for programs: one object for each row.
     pub(crate) fn to_json(&self) -> Value {
         let beside = |beside: &Option<Beside>| {
-            beside.as_ref().map(|b| json!({ "name": b.name, "figure": b.figure, "ratio": b.ratio }))
+            beside
+                .as_ref()
+                .map(|b| json!({ "name": b.name, "figure": b.figure, "ratio": b.ratio }))
         };
         self.rows
             .iter()
@@ -95,10 +97,20 @@ impl Table {
 
     /// The table for people.
     pub(crate) fn to_text(&self) -> String {
-        let head = ["what", "unit", "ddx", "floor", "ratio", "peer", "ratio", "budget"].map(str::to_owned);
-        let lines: Vec<[String; 8]> = std::iter::once(head).chain(self.rows.iter().map(Row::cells)).collect();
-        let widths: [usize; 8] =
-            std::array::from_fn(|column| lines.iter().map(|line| line[column].chars().count()).max().unwrap_or(0));
+        let head = [
+            "what", "unit", "ddx", "floor", "ratio", "peer", "ratio", "budget",
+        ]
+        .map(str::to_owned);
+        let lines: Vec<[String; 8]> = std::iter::once(head)
+            .chain(self.rows.iter().map(Row::cells))
+            .collect();
+        let widths: [usize; 8] = std::array::from_fn(|column| {
+            lines
+                .iter()
+                .map(|line| line[column].chars().count())
+                .max()
+                .unwrap_or(0)
+        });
         let mut text = String::new();
         for line in lines {
             for (cell, width) in line.iter().zip(widths) {
@@ -130,13 +142,20 @@ impl Row {
 
 fn cells_of(beside: Option<&Beside>) -> [String; 2] {
     beside.map_or(["-".to_owned(), "-".to_owned()], |b| {
-        [format!("{} {}", b.name, number(b.figure)), format!("{:.2}", b.ratio)]
+        [
+            format!("{} {}", b.name, number(b.figure)),
+            format!("{:.2}", b.ratio),
+        ]
     })
 }
 
 /// Three digits or so.
 fn number(figure: f64) -> String {
-    let digits = if figure.abs() < 10.0 { 2 } else { usize::from(figure.abs() < 100.0) };
+    let digits = if figure.abs() < 10.0 {
+        2
+    } else {
+        usize::from(figure.abs() < 100.0)
+    };
     format!("{figure:.digits$}")
 }
 
@@ -147,8 +166,19 @@ mod tests {
     #[test]
     fn columns_line_up_and_what_was_not_measured_is_a_dash() {
         let mut table = Table::default();
-        let contest = Contest::run(1, &mut [&mut || Ok(vec![2_500.0]), &mut || Ok(vec![2_000.0])]).unwrap();
-        table.contest("wake".to_owned(), ("us", 1e3), (&contest, 0), Some(("futex", 1)), None, "1.25x");
+        let contest = Contest::run(
+            1,
+            &mut [&mut || Ok(vec![2_500.0]), &mut || Ok(vec![2_000.0])],
+        )
+        .unwrap();
+        table.contest(
+            "wake".to_owned(),
+            ("us", 1e3),
+            (&contest, 0),
+            Some(("futex", 1)),
+            None,
+            "1.25x",
+        );
 
         assert_eq!(
             table.to_text(),
@@ -160,7 +190,14 @@ mod tests {
     #[test]
     fn a_row_without_a_figure_is_no_figure() {
         let mut table = Table::default();
-        table.contest("x".to_owned(), ("us", 1.0), (&Contest::run(0, &mut []).unwrap(), 0), None, None, "");
+        table.contest(
+            "x".to_owned(),
+            ("us", 1.0),
+            (&Contest::run(0, &mut []).unwrap(), 0),
+            None,
+            None,
+            "",
+        );
 
         assert!(!table.is_complete());
     }

@@ -67,16 +67,22 @@ impl Board {
 
     fn open(name: &str) -> Result<Self> {
         let node = NodeBuilder::new().create::<ipc::Service>()?;
-        let factory = node.service_builder(&service_name(name)?).blackboard_opener::<u64>().open()?;
+        let factory = node
+            .service_builder(&service_name(name)?)
+            .blackboard_opener::<u64>()
+            .open()?;
         Ok(Self { factory })
     }
 
     fn writer(&self) -> Result<BoardWriter> {
-        Ok(BoardWriter(self.factory.writer_builder().create()?.entry(&KEY)?))
+        Ok(BoardWriter(
+            self.factory.writer_builder().create()?.entry(&KEY)?,
+        ))
     }
 
     fn reader(&self) -> Result<BoardReader> {
-        let entry: EntryHandle<ipc::Service, u64, [u64; WORDS]> = self.factory.reader_builder().create()?.entry(&KEY)?;
+        let entry: EntryHandle<ipc::Service, u64, [u64; WORDS]> =
+            self.factory.reader_builder().create()?.entry(&KEY)?;
         Ok(BoardReader { entry, seen: 0 })
     }
 }
@@ -158,10 +164,16 @@ impl<const N: usize> Voice<N> {
     fn open(name: &str) -> Result<Self> {
         let node = NodeBuilder::new().create::<ipc::Service>()?;
         let name = service_name(name)?;
-        let service = node.service_builder(&name).publish_subscribe::<[u64; N]>().open_or_create()?;
+        let service = node
+            .service_builder(&name)
+            .publish_subscribe::<[u64; N]>()
+            .open_or_create()?;
         let event = node.service_builder(&name).event().open_or_create()?;
         let publisher = service.publisher_builder().create()?;
-        Ok(Self { publisher, notifier: event.notifier_builder().create()? })
+        Ok(Self {
+            publisher,
+            notifier: event.notifier_builder().create()?,
+        })
     }
 }
 
@@ -169,10 +181,16 @@ impl<const N: usize> Ear<N> {
     fn open(name: &str) -> Result<Self> {
         let node = NodeBuilder::new().create::<ipc::Service>()?;
         let name = service_name(name)?;
-        let service = node.service_builder(&name).publish_subscribe::<[u64; N]>().open_or_create()?;
+        let service = node
+            .service_builder(&name)
+            .publish_subscribe::<[u64; N]>()
+            .open_or_create()?;
         let event = node.service_builder(&name).event().open_or_create()?;
         let subscriber = service.subscriber_builder().create()?;
-        Ok(Self { subscriber, listener: event.listener_builder().create()? })
+        Ok(Self {
+            subscriber,
+            listener: event.listener_builder().create()?,
+        })
     }
 }
 
@@ -206,7 +224,10 @@ fn published<const N: usize>(count: usize, cores: Cores) -> Result<Vec<u64>> {
     let side = |own: &'static str, other: &'static str| {
         let made = &made;
         move || {
-            let side = Side { to: Voice::<N>::open(own)?, from: Ear::<N>::open(other)? };
+            let side = Side {
+                to: Voice::<N>::open(own)?,
+                from: Ear::<N>::open(other)?,
+            };
             made.wait();
             Ok(side)
         }
