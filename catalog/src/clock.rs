@@ -7,8 +7,7 @@ use std::collections::VecDeque;
 
 use ddx_wire::{ClockOffset, Time};
 
-/// Greatest drift of two clocks against one another, as a divisor: 200 parts per million, twice what crystals are sold with.
-const DRIFT_DIVISOR: u64 = 5_000;
+const DRIFT_DIVISOR: u64 = ClockOffset::DRIFT_DIVISOR;
 /// How long an estimate is used before the next replaces it, nanoseconds; drift over that time is part of the bound.
 const VALID_NS: u64 = 1_250_000_000;
 const KEPT: usize = 16;

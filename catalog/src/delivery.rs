@@ -97,6 +97,17 @@ pub enum ReceiverEvent {
         /// Number of the newest sample held.
         seq: Seq,
     },
+    /// New samples keep coming: the next renewal can say what is held and which way works.
+    Flows {
+        /// The sender.
+        tag: Tag,
+        /// The stream.
+        stream: StreamId,
+        /// Epoch of the newest sample held.
+        epoch: Epoch,
+        /// Number of the newest sample held.
+        seq: Seq,
+    },
     /// Samples of the stream arrive by multicast.
     OnGroup {
         /// The sender.

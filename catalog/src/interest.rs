@@ -16,11 +16,12 @@ use crate::event::Event;
 use crate::outbox::Outbox;
 
 const RENEW_PERIOD: Duration = Duration::from_secs(1);
-/// An unanswered renewal is repeated after this, twice this and so on, then at the usual period.
-const RENEW_RETRY: Duration = Duration::from_millis(50);
-const RENEW_TRIES: u32 = 4;
-const ASK_RETRY: Duration = Duration::from_millis(50);
-const ASK_RETRY_MAX: Duration = Duration::from_secs(1);
+/// What is unanswered is said again after this, twice this, and so on up to eight times this.
+const RETRY: Duration = Duration::from_millis(50);
+/// So often; then the other host is thought away, and tried each second. At a loss of one in three, fewer fast tries
+/// in a row would fail now and then, and with them the lease.
+const RETRIES: u32 = 16;
+const RETRY_SLOW: Duration = Duration::from_secs(1);
 /// Acks of several streams that fall quiet together travel together.
 const ACK_AFTER: Duration = Duration::from_millis(20);
 /// A path that was seen to work is reported after this, together with its neighbours.
@@ -222,7 +223,7 @@ impl Interest {
             let Some(stream) = entry.stream else {
                 // The owner does not have the item yet, or any longer: its directory will say, meanwhile ask slowly.
                 if let Phase::Asked { next, .. } = &mut want.phase {
-                    *next = now + ASK_RETRY_MAX;
+                    *next = now + RETRY_SLOW;
                 }
                 continue;
             };
@@ -479,13 +480,7 @@ impl Interest {
                 }
             }
             if link.next_renewal <= now {
-                let fast = link.unanswered < RENEW_TRIES;
-                let pause = if fast {
-                    RENEW_RETRY * 2_u32.pow(link.unanswered)
-                } else {
-                    RENEW_PERIOD
-                };
-                link.next_renewal = now + pause;
+                link.next_renewal = now + retry_after(link.unanswered);
                 link.unanswered = link.unanswered.saturating_add(1);
                 link.sent = now;
                 renewed.push(*owner);
@@ -557,8 +552,8 @@ impl Interest {
             if *next > now {
                 continue;
             }
-            *next = now + (ASK_RETRY * 2_u32.pow((*tries).min(5))).min(ASK_RETRY_MAX);
-            *tries += 1;
+            *next = now + retry_after(*tries);
+            *tries = tries.saturating_add(1);
             let (entries, bytes) = requests.entry(*owner).or_default();
             let more = name.as_str().len() + ASK_ENTRY_BYTES;
             if *bytes + more > ASK_BYTES {
@@ -669,6 +664,15 @@ impl Phase {
             Self::Pending => None,
             Self::Asked { name, .. } | Self::Granted { name, .. } => Some(name.clone()),
         }
+    }
+}
+
+/// How long to wait for an answer after so many tries without one.
+fn retry_after(tries: u32) -> Duration {
+    if tries < RETRIES {
+        RETRY * 2_u32.pow(tries.min(3))
+    } else {
+        RETRY_SLOW
     }
 }
 

@@ -58,12 +58,13 @@ pub(crate) enum Order {
 
 /// What the thread tells the control loop.
 pub(crate) enum Notice {
-    /// What is held of a stream that fell quiet, to be acknowledged.
-    Quiet {
+    /// What is held of a stream; to be acknowledged soon if it fell quiet.
+    Holds {
         tag: Tag,
         stream: StreamId,
         epoch: Epoch,
         seq: Seq,
+        quiet: bool,
     },
     /// Samples of a stream arrive by multicast.
     OnGroup { tag: Tag, stream: StreamId },
@@ -82,7 +83,8 @@ struct State {
     receiver: Receiver,
     mirrors: HashMap<MirrorId, Mirror>,
     streams: HashMap<(Tag, StreamId), MirrorId>,
-    clocks: HashMap<Tag, ClockOffset>,
+    /// What is known of the senders' clocks, and since when.
+    clocks: HashMap<Tag, (ClockOffset, Time)>,
     notices: mailbox::Sender<Notice>,
     traffic: Arc<Traffic>,
     told: Time,
@@ -143,6 +145,7 @@ impl Rx {
 
 impl State {
     fn run(&mut self, sockets: &[UdpSocket; 2], inbox: &mailbox::Receiver<Order>) {
+        let mut ready = [true; 2];
         loop {
             for order in inbox.drain() {
                 if matches!(order, Order::Stop) {
@@ -150,20 +153,26 @@ impl State {
                 }
                 self.obey(order);
             }
-            let mut arrived = false;
-            for index in 0..self.channels.len() {
-                arrived |= self.receive(index);
+            let mut arrived = 0;
+            for (index, ready) in ready.into_iter().enumerate() {
+                if ready {
+                    arrived += self.receive(index);
+                }
             }
             let now = ddx_store::now();
             self.receiver.handle_timeout(now);
             self.report(now);
-            if !arrived && !self.spin {
-                self.sleep([sockets[0].as_fd(), sockets[1].as_fd(), inbox.as_fd()], now);
+            if !self.spin {
+                ready = self.sleep([sockets[0].as_fd(), sockets[1].as_fd(), inbox.as_fd()], now);
+            } else if arrived == 0 {
+                // Where there are fewer cores than threads that spin, the others get their turn.
+                thread::yield_now();
             }
         }
     }
 
-    fn sleep(&self, fds: [BorrowedFd<'_>; 3], now: Time) {
+    /// Sleeps until something is there, and says which of the sockets has something.
+    fn sleep(&self, fds: [BorrowedFd<'_>; 3], now: Time) -> [bool; 2] {
         let span = self
             .receiver
             .poll_timeout()
@@ -173,12 +182,15 @@ impl State {
             tv_nsec: span.subsec_nanos().into(),
         };
         let mut fds = fds.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
-        // A signal or a time-out both mean: look again.
-        poll(&mut fds, Some(&span)).ok();
+        match poll(&mut fds, Some(&span)) {
+            Ok(_) => [0, 1].map(|socket| !fds[socket].revents().is_empty()),
+            // A signal: look at all.
+            Err(_) => [true; 2],
+        }
     }
 
-    /// Takes what one socket has, up to a bound, so that neither socket nor the orders starve.
-    fn receive(&mut self, index: usize) -> bool {
+    /// Takes what one socket has, up to a bound, so that neither socket nor the orders starve. Returns how many datagrams.
+    fn receive(&mut self, index: usize) -> usize {
         let Self {
             channels,
             receiver,
@@ -200,20 +212,27 @@ impl State {
                         .get(&(sample.tag, sample.stream))
                         .and_then(|id| mirrors.get_mut(id));
                     if let Some(mirror) = mirror {
-                        mirror.take(&sample, clocks.get(&sample.tag), now, traffic);
+                        // Nothing may have renewed it since the last stream ended.
+                        let clock = clocks.get(&sample.tag);
+                        let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
+                        mirror.take(&sample, clock.as_ref(), now, traffic);
                     }
                 }
             });
             match taken {
-                Ok(0) => break,
-                Ok(taken) => total += taken,
+                Ok(batch) => {
+                    total += batch.datagrams;
+                    if !batch.full {
+                        break;
+                    }
+                }
                 Err(error) => {
                     tracing::debug!(%error, "receiving samples");
                     break;
                 }
             }
         }
-        total > 0
+        total
     }
 
     fn obey(&mut self, order: Order) {
@@ -251,7 +270,7 @@ impl State {
                 self.streams.remove(&(tag, stream));
             }
             Order::Clock { tag, offset } => {
-                self.clocks.insert(tag, offset);
+                self.clocks.insert(tag, (offset, ddx_store::now()));
             }
             Order::Stop => {}
         }
@@ -265,11 +284,24 @@ impl State {
                     stream,
                     epoch,
                     seq,
-                } => Notice::Quiet {
+                } => Notice::Holds {
                     tag,
                     stream,
                     epoch,
                     seq,
+                    quiet: true,
+                },
+                ReceiverEvent::Flows {
+                    tag,
+                    stream,
+                    epoch,
+                    seq,
+                } => Notice::Holds {
+                    tag,
+                    stream,
+                    epoch,
+                    seq,
+                    quiet: false,
                 },
                 ReceiverEvent::OnGroup { tag, stream } => Notice::OnGroup { tag, stream },
             };

@@ -163,6 +163,10 @@ impl State {
                 self.sleep_for(ddx_store::now())
             };
             self.set.wait(timeout, &mut rung);
+            if self.spin && rung.is_empty() {
+                // Where there are fewer cores than threads that spin, the others get their turn.
+                thread::yield_now();
+            }
         }
     }
 

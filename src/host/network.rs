@@ -304,14 +304,15 @@ impl Network {
             .ok();
         for notice in self.notices.drain() {
             match notice {
-                rx::Notice::Quiet {
+                rx::Notice::Holds {
                     tag,
                     stream,
                     epoch,
                     seq,
+                    quiet,
                 } => {
                     self.catalog
-                        .holds(tag, stream, epoch, seq, true, ddx_store::now());
+                        .holds(tag, stream, epoch, seq, quiet, ddx_store::now());
                 }
                 rx::Notice::OnGroup { tag, stream } => {
                     self.catalog.heard_on_group(tag, stream, ddx_store::now());

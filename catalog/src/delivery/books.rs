@@ -123,6 +123,11 @@ impl Ledger {
             Some(_) => (meta.seq.0.saturating_sub(1), meta.filtered, 1),
         };
         let filtered = filtered.min(skipped);
+        // What failed before the first sample lies outside the range that the books are about.
+        if self.newest.is_none() {
+            self.failed
+                .retain(|(epoch, seq, _)| (*epoch, *seq) > key(meta));
+        }
         let books = &mut self.books;
         books.expected = books.expected.saturating_add(skipped).saturating_add(1);
         books.delivered += 1;
@@ -277,6 +282,15 @@ mod tests {
         assert!(books.balanced());
         assert_eq!(ledger.judge(&meta(1, 2, 0)), Standing::Old);
         assert_eq!(ledger.books().duplicates, 1);
+    }
+
+    #[test]
+    fn failure_before_the_first_is_outside_the_range() {
+        let mut ledger = Ledger::default();
+        ledger.fail(&meta(1, 4, 0), Failure::Expired);
+        ledger.deliver(&meta(1, 6, 0));
+        let books = ledger.books();
+        assert_eq!((books.expected, books.delivered, books.expired), (1, 1, 0));
     }
 
     #[test]

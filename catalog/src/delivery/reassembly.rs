@@ -78,8 +78,9 @@ impl Reassembly {
                 ranges: Vec::new(),
             };
             self.partials.insert(at, partial);
-            self.deadlines.set(at, now + DEADLINE);
         }
+        // Each fragment prolongs it, so that what one repeat lost the next can bring.
+        self.deadlines.set(at, now + DEADLINE);
         let added = self
             .partials
             .get_mut(&at)
@@ -207,7 +208,7 @@ impl Partial {
     }
 }
 
-/// `PROTOCOL.md#fragments`: an incomplete sample is given up 500 ms after its first fragment.
+/// `PROTOCOL.md#fragments`: an incomplete sample is given up 500 ms after its last fragment.
 const DEADLINE: Duration = Duration::from_millis(500);
 /// Gaps in a sample: a sample of 64 KiB in fragments of a full datagram has fewer.
 const RANGES: usize = 64;

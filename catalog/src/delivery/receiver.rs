@@ -63,8 +63,17 @@ struct Stream {
     last_new: Time,
     /// When it was last told that this stream arrives by multicast.
     told_on_group: Option<Time>,
-    /// A [`ReceiverEvent::Quiet`] for it waits in the queue of events.
-    telling: bool,
+    /// What waits for it in the queue of events.
+    telling: Option<Telling>,
+    /// When it was last told what is held.
+    told_held: Time,
+}
+
+/// Why it is told what is held of a stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Telling {
+    Flows,
+    Quiet,
 }
 
 #[derive(Debug)]
@@ -146,10 +155,13 @@ impl Receiver {
                 continue;
             };
             let at = stream.last_new + QUIET;
-            if at > now {
-                self.quiet.set((tag, id), at);
-            } else {
-                stream.tell(tag, id, &mut self.events);
+            if at <= now {
+                stream.tell(Telling::Quiet, (tag, id), now, &mut self.events);
+                continue;
+            }
+            self.quiet.set((tag, id), at);
+            if now.since(stream.told_held) >= FLOWS_PERIOD {
+                stream.tell(Telling::Flows, (tag, id), now, &mut self.events);
             }
         }
     }
@@ -174,14 +186,22 @@ impl Receiver {
             let Some(stream) = self.streams.get_mut(&(tag, id)) else {
                 continue;
             };
-            if let (true, Some((epoch, seq))) =
-                (std::mem::take(&mut stream.telling), stream.ledger.newest())
-            {
-                return Some(ReceiverEvent::Quiet {
-                    tag,
-                    stream: id,
-                    epoch,
-                    seq,
+            let telling = stream.telling.take();
+            if let (Some(telling), Some((epoch, seq))) = (telling, stream.ledger.newest()) {
+                let stream = id;
+                return Some(match telling {
+                    Telling::Quiet => ReceiverEvent::Quiet {
+                        tag,
+                        stream,
+                        epoch,
+                        seq,
+                    },
+                    Telling::Flows => ReceiverEvent::Flows {
+                        tag,
+                        stream,
+                        epoch,
+                        seq,
+                    },
                 });
             }
         }
@@ -263,7 +283,8 @@ impl Receiver {
             Standing::Again => {
                 // The sender repeats what is held already: its confirmation was lost.
                 if record.repeat {
-                    stream.tell(tag, record.stream, &mut self.events);
+                    let key = (tag, record.stream);
+                    stream.tell(Telling::Quiet, key, now, &mut self.events);
                 }
                 return;
             }
@@ -315,7 +336,7 @@ impl Receiver {
         });
         if record.repeat {
             // The sender waits for this confirmation with its next repeat.
-            stream.tell(tag, id, &mut self.events);
+            stream.tell(Telling::Quiet, (tag, id), now, &mut self.events);
         } else {
             self.quiet.set_if_idle((tag, id), now + QUIET);
         }
@@ -323,11 +344,18 @@ impl Receiver {
 }
 
 impl Stream {
-    fn tell(&mut self, tag: Tag, id: StreamId, events: &mut VecDeque<(Tag, StreamId)>) {
-        if !self.telling {
-            self.telling = true;
-            events.push_back((tag, id));
+    fn tell(
+        &mut self,
+        why: Telling,
+        key: (Tag, StreamId),
+        now: Time,
+        events: &mut VecDeque<(Tag, StreamId)>,
+    ) {
+        self.told_held = now;
+        if self.telling.is_none() {
+            events.push_back(key);
         }
+        self.telling = self.telling.max(Some(why));
     }
 }
 
@@ -345,6 +373,9 @@ impl ReceiverConfig {
 
 /// Arrival by multicast is told again so often: a path may have changed meanwhile.
 const ON_GROUP_PERIOD: Duration = Duration::from_millis(200);
+
+/// What is held of a stream that never falls quiet is told so often: in time for each renewal.
+const FLOWS_PERIOD: Duration = Duration::from_millis(500);
 
 /// `PROTOCOL.md#acks-and-repeats`: a stream is quiet 100 ms after its last new sample.
 const QUIET: Duration = Duration::from_millis(100);

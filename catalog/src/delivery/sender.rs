@@ -247,6 +247,8 @@ impl Sender {
                 .repeat_asked_at
                 .is_none_or(|asked| now >= asked + REPEAT_NEXT);
         if reader.is_behind() && overdue && !reader.wanting {
+            // It is there, perhaps again: one repeat might be lost, or a fragment of it.
+            reader.repeats = reader.repeats.min(REPEAT_LIMIT - REPEATS_AGAIN);
             reader.wanting = true;
             reader.repeat_asked_at = Some(now);
             self.events.push_back((id, tag));
@@ -467,6 +469,8 @@ const REPEAT_FIRST: Duration = Duration::from_millis(130);
 const REPEAT_NEXT: Duration = Duration::from_millis(60);
 /// Repeats before the reader's renewals, once a second, take over.
 const REPEAT_LIMIT: u32 = 15;
+/// Repeats for each renewal of a reader that is still behind.
+const REPEATS_AGAIN: u32 = 8;
 /// Assumed until measured: more than a LAN or a fair radio link takes.
 const ROUND_TRIP_UNKNOWN: Duration = Duration::from_millis(50);
 /// A peer that answers ever more slowly must not put repeats off for ever.

@@ -50,6 +50,22 @@ impl Sub<Duration> for Time {
 }
 
 impl ClockOffset {
+    /// Greatest drift of two clocks against one another, as a divisor: 200 parts per million, twice what crystals are
+    /// sold with.
+    pub const DRIFT_DIVISOR: u64 = 5_000;
+
+    /// The same figure so much later: clocks drift, so its error may have grown.
+    #[must_use]
+    pub fn aged(self, age: Duration) -> Self {
+        let age = u64::try_from(age.as_nanos()).unwrap_or(u64::MAX);
+        Self {
+            bound_ns: self
+                .bound_ns
+                .saturating_add(age.div_ceil(Self::DRIFT_DIVISOR)),
+            ..self
+        }
+    }
+
     /// The instant on our clock that the peer calls `peer`, within [`ClockOffset::bound_ns`].
     pub fn to_local(self, peer: Time) -> Time {
         Time(
@@ -75,6 +91,16 @@ mod tests {
             bound_ns: 1,
         };
         assert_eq!(behind.to_local(Time(95)), Time(100));
+    }
+
+    #[test]
+    fn bound_grows_with_age() {
+        let fresh = ClockOffset {
+            offset_ns: 5,
+            bound_ns: 100,
+        };
+        let aged = fresh.aged(Duration::from_secs(1));
+        assert_eq!((aged.offset_ns, aged.bound_ns), (5, 200_100));
     }
 
     #[test]

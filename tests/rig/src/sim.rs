@@ -1,34 +1,37 @@
-//! A domain of many hosts in one thread under virtual time: the control planes are real, the network and the clocks are not.
+//! A domain of many hosts in one thread under virtual time: all pure machines are real, what lies between them is not.
 //!
-//! Everything is a function of the seed. Each host has a boot clock with its own start and drift; datagrams are lost,
-//! delayed, reordered, duplicated and cut off by partitions. Samples are modelled, not sealed: [`Sim::publish`] gives each
-//! reading host the sample by every path that its stream has and that host can hear.
+//! Everything is a function of the seed. Each host has a boot clock with its own start and drift, a model store, and the
+//! real control plane, sender and receiver, driven as the daemon drives them. Datagrams, which are sealed as in earnest,
+//! are lost, delayed, reordered, duplicated and cut off by partitions; a multicast is carried to each member by itself.
+//! Promises that must hold at every sample are checked as it passes, and [`Sim::broken`] lists those that did not.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
+use std::collections::{BTreeMap, BinaryHeap};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_catalog::delivery::{Path, Route};
 use ddx_catalog::{Catalog, Config, Dest, Event};
-use ddx_wire::seal::DomainKey;
+use ddx_wire::seal::MAX_DATAGRAM_BYTES;
 use ddx_wire::{
-    Contract, DomainId, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName,
-    SchemaHash, Seq, StreamId, Tag, Time, WriterState,
+    Contract, DomainId, Epoch, HostId, HostName, Incarnation, ItemName, Seq, Tag, Time,
 };
 
-/// What the network does to a datagram.
-#[derive(Clone, Copy, Debug)]
-pub struct Link {
-    /// Share of datagrams that are lost.
-    pub loss: f64,
-    /// Share of datagrams that arrive twice.
-    pub duplicates: f64,
-    /// Least time on the way.
-    pub delay: Duration,
-    /// Further time on the way, at most; more than the spacing of datagrams reorders them.
-    pub jitter: Duration,
-}
+mod host;
+mod net;
+mod random;
+mod rx;
+mod store;
+mod tx;
+
+pub use host::Host;
+use host::HostClock;
+pub use net::Link;
+use net::{CONTROL_PORT, DATA_PORT, Net, Way};
+pub use random::Random;
+pub use tx::Counts;
+
+/// A lease lasts three seconds and is looked at four times a second; the rest is for queues and slow clocks.
+const LEASE_AT_MOST: Duration = Duration::from_millis(3_300);
 
 /// What a simulation is made of.
 #[derive(Clone, Debug)]
@@ -43,23 +46,28 @@ pub struct Setup {
     pub beacon: bool,
     /// Greatest drift of a clock, parts per million, either way.
     pub drift_ppm: u32,
+    /// How long an order or a notice waits between two threads of a host, at most.
+    pub lag: Duration,
 }
 
 /// The simulation.
 pub struct Sim {
     setup: Setup,
     now: u64,
-    random: u64,
+    random: Random,
     count: u64,
     queue: BinaryHeap<Reverse<(u64, u64, Action)>>,
+    net: Net,
     hosts: Vec<Host>,
-    /// Hosts hear each other only within one group.
-    groups: Vec<usize>,
-    /// What the hosts told their drivers, with the time; clocks and what is held are left out.
+    tags: BTreeMap<Tag, usize>,
+    interest: BTreeMap<ItemName, Interest>,
+    /// What became of hosts, as each host saw it, with the time.
     pub log: Vec<(Duration, usize, Event)>,
+    /// Promises that were broken, with the time and the host.
+    pub broken: Vec<(Duration, usize, String)>,
     /// Datagrams that were handed to hosts.
     pub delivered: u64,
-    /// Bytes of all datagrams that hosts sent; a beacon counts once.
+    /// Bytes of all control datagrams that hosts sent; a beacon counts once.
     pub sent_bytes: u64,
     /// Clock estimates that did not contain the truth.
     pub clock_errors: u64,
@@ -67,31 +75,11 @@ pub struct Sim {
     pub clock_estimates: u64,
 }
 
-/// One simulated host.
-pub struct Host {
-    /// Its control plane; `None` while it is off.
-    pub catalog: Option<Catalog>,
-    /// Its name.
-    pub name: HostName,
-    /// Items of other hosts that its driver was told of.
-    pub known: BTreeMap<ItemName, ItemDescription>,
-    /// Streams that its driver was told to send.
-    pub open: BTreeMap<StreamId, (ItemName, Route)>,
-    /// Streams that its driver was told to expect.
-    pub expected: BTreeMap<(Tag, StreamId), ItemName>,
-    /// What its readers hold.
-    pub held: BTreeMap<ItemName, (Epoch, Seq)>,
-    /// Groups that its driver was told to join.
-    pub joined: BTreeSet<SocketAddr>,
-    /// Whether its network passes multicast samples on.
-    pub hears_groups: bool,
-    /// Copies of samples that reached it.
-    pub copies: u64,
-    id: HostId,
-    addr: SocketAddr,
-    clock_start: u64,
-    drift_ppm: i64,
-    wake: u64,
+/// Who reads an item, in truth.
+#[derive(Default)]
+struct Interest {
+    readers: usize,
+    ended: u64,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -100,20 +88,9 @@ enum Action {
     Deliver {
         to: usize,
         from: usize,
+        way: Way,
         bytes: Vec<u8>,
     },
-}
-
-impl Link {
-    /// A quiet local network that loses this share of datagrams.
-    pub fn lan(loss: f64) -> Self {
-        Self {
-            loss,
-            duplicates: 0.01,
-            delay: Duration::from_micros(100),
-            jitter: Duration::from_micros(400),
-        }
-    }
 }
 
 impl Setup {
@@ -125,6 +102,7 @@ impl Setup {
             link: Link::lan(loss),
             beacon: true,
             drift_ppm: 90,
+            lag: Duration::ZERO,
         }
     }
 }
@@ -132,83 +110,71 @@ impl Setup {
 impl Sim {
     /// Starts all hosts within the first ten milliseconds.
     pub fn new(setup: Setup) -> Self {
+        let mut random = Random::new(setup.seed);
+        let net = Net::new(setup.link, Random::new(random.next()), setup.hosts);
+        let mut hosts = Vec::new();
+        for index in 0..setup.hosts {
+            let name = HostName::parse(&format!("h{index}")).expect("letter and digits are a name");
+            let id = HostId((u128::try_from(index).unwrap_or(0) + 1).to_be_bytes());
+            let spread = u64::from(setup.drift_ppm) * 2 + 1;
+            let drift = i64::try_from(random.below(spread)).unwrap_or(0);
+            let clock = HostClock {
+                start: random.below(1_000_000_000_000_000),
+                drift_ppm: drift - i64::from(setup.drift_ppm),
+            };
+            hosts.push(Host::new(name, id, clock));
+        }
         let mut sim = Self {
+            setup,
             now: 0,
-            random: setup.seed,
+            random,
             count: 0,
             queue: BinaryHeap::new(),
-            hosts: Vec::new(),
-            groups: vec![0; setup.hosts],
+            net,
+            hosts,
+            tags: BTreeMap::new(),
+            interest: BTreeMap::new(),
             log: Vec::new(),
+            broken: Vec::new(),
             delivered: 0,
             sent_bytes: 0,
             clock_errors: 0,
             clock_estimates: 0,
-            setup,
         };
         for index in 0..sim.setup.hosts {
-            let spread = u64::from(sim.setup.drift_ppm) * 2 + 1;
-            let drift = i64::try_from(sim.below(spread)).unwrap_or(0);
-            let (high, low) = (index / 250, index % 250 + 1);
-            let host = Host {
-                catalog: None,
-                name: HostName::parse(&format!("h{index}"))
-                    .expect("a letter and digits are a name"),
-                known: BTreeMap::new(),
-                open: BTreeMap::new(),
-                expected: BTreeMap::new(),
-                held: BTreeMap::new(),
-                joined: BTreeSet::new(),
-                hears_groups: true,
-                copies: 0,
-                id: HostId((u128::try_from(index).unwrap_or(0) + 1).to_be_bytes()),
-                addr: format!("10.0.{high}.{low}:7000")
-                    .parse()
-                    .expect("an address"),
-                clock_start: sim.below(1_000_000_000_000_000),
-                drift_ppm: drift - i64::from(sim.setup.drift_ppm),
-                wake: u64::MAX,
-            };
-            sim.hosts.push(host);
-        }
-        for index in 0..sim.setup.hosts {
-            let ordinal = 1;
-            sim.start(index, ordinal);
+            sim.start(index, 1);
         }
         sim
     }
 
-    /// Starts a host anew, as a life with this ordinal.
+    /// Starts a host anew, with an empty store, as a life with this ordinal.
     pub fn start(&mut self, index: usize, ordinal: u32) {
-        let random = self.next();
-        let seed = self.next();
-        let now = self.local(index);
-        let first = self.hosts.first().map(|host| host.addr);
+        self.kill(index);
+        let (random, seed) = (self.random.next(), self.random.next());
         let host = &mut self.hosts[index];
+        let now = host.clock.moment(self.now);
+        let seeds = if self.setup.beacon || index == 0 {
+            Vec::new()
+        } else {
+            vec![net::address(0, CONTROL_PORT)]
+        };
         let config = Config {
             domain: DomainId(3),
             host: host.name.clone(),
             id: host.id,
             incarnation: Incarnation { ordinal, random },
-            key: DomainKey::from_bytes([9; 32]),
-            control_addrs: vec![host.addr],
-            data_port: 7001,
-            seeds: first
-                .filter(|_| !self.setup.beacon && index > 0)
-                .into_iter()
-                .collect(),
+            key: host::key(),
+            control_addrs: vec![net::address(index, CONTROL_PORT)],
+            data_port: DATA_PORT,
+            seeds,
             beacon: self.setup.beacon,
             multicast: true,
-            prefix_since: now,
+            prefix_since: now.local,
         };
-        host.catalog = Some(Catalog::new(config, seed, now));
-        host.known.clear();
-        host.open.clear();
-        host.expected.clear();
-        host.held.clear();
-        host.joined.clear();
-        host.wake = u64::MAX;
-        let late = self.below(10_000_000);
+        self.tags
+            .insert(Tag::of(config.id, config.incarnation), index);
+        host.start(config, self.setup.lag, seed, now);
+        let late = self.random.below(10_000_000);
         self.push(self.now + late, Action::Wake(index));
     }
 
@@ -217,9 +183,14 @@ impl Sim {
         self.hosts[index].name = HostName::parse(name).expect("the caller passes a host name");
     }
 
-    /// Switches a host off, without a word.
+    /// Switches a host off, without a word. What its programs read is over.
     pub fn kill(&mut self, index: usize) {
-        self.hosts[index].catalog = None;
+        let wanted: Vec<ItemName> = self.hosts[index].wanted.keys().cloned().collect();
+        for name in wanted {
+            self.reader_left(&name);
+        }
+        self.hosts[index].stop();
+        self.collect(index);
     }
 
     /// One host.
@@ -239,97 +210,81 @@ impl Sim {
 
     /// What the clock of a host shows.
     pub fn local(&self, index: usize) -> Time {
-        let host = &self.hosts[index];
-        let drift = i128::from(self.now) * i128::from(host.drift_ppm) / 1_000_000;
-        let local = i128::from(host.clock_start) + i128::from(self.now) + drift;
-        Time(u64::try_from(local).unwrap_or(0))
+        self.hosts[index].clock.at(self.now)
     }
 
     /// Splits the network: hosts hear each other only within one group.
     pub fn cut(&mut self, group_of: impl Fn(usize) -> usize) {
-        self.groups = (0..self.hosts.len()).map(group_of).collect();
+        self.net.cut(group_of);
     }
 
     /// Ends a split.
     pub fn heal(&mut self) {
-        self.cut(|_| 0);
+        self.net.cut(|_| 0);
     }
 
     /// Changes the network for datagrams that are sent from now on.
     pub fn set_link(&mut self, link: Link) {
-        self.setup.link = link;
+        self.net.link = link;
     }
 
-    /// Announces an item of a host under its prefix.
+    /// Opens a writer of an item under a host's prefix: a new item, or a new epoch of one that is there.
     pub fn announce(&mut self, index: usize, rest: &str) -> ItemName {
         let name = ItemName::parse(&format!("./{rest}"), &self.hosts[index].name)
             .expect("the caller passes a name");
-        let description = ItemDescription {
-            name: name.clone(),
-            schema_hash: SchemaHash([1; 16]),
-            capacity_bytes: 8,
-            epoch: Epoch::new(1, 1),
-            writer: WriterState::Live,
-            program: "sim".to_owned(),
-        };
-        self.command(index, |catalog, now| {
-            catalog
-                .announce(description, "u64", now)
-                .expect("the directory has room");
-        });
+        let now = self.moment(index);
+        self.hosts[index].open_writer(&name, now);
+        self.settle(index);
         name
     }
 
-    /// Subscribes a host to an item.
+    /// Removes an item of a host.
+    pub fn withdraw(&mut self, index: usize, name: &ItemName) {
+        if let Some(data) = &mut self.hosts[index].data {
+            data.store.remove(name);
+        }
+        self.command(index, |catalog, now| catalog.withdraw(name, now));
+    }
+
+    /// Writes the next sample of an item, `len` bytes long unless that is too short to tell what it is.
+    /// Its order; `None` when the host is off or has no such item.
+    pub fn write(&mut self, index: usize, name: &ItemName, len: usize) -> Option<(Epoch, Seq)> {
+        let now = self.moment(index);
+        let owner = u64::try_from(index).unwrap_or(u64::MAX);
+        let data = self.hosts[index].data.as_mut()?;
+        let written = data.store.write(name, len, owner, now.truth, now.local);
+        self.settle(index);
+        written
+    }
+
+    /// Opens the first reader of an item on a host, or changes what its readers ask.
     pub fn subscribe(&mut self, index: usize, name: &ItemName, contract: Contract) {
-        self.command(index, |catalog, now| {
-            catalog
-                .subscribe(name.clone(), contract, now)
-                .expect("there is room");
-        });
+        let now = self.moment(index);
+        let host = &mut self.hosts[index];
+        if host.catalog.is_some() && !host.wanted.contains_key(name) {
+            self.interest.entry(name.clone()).or_default().readers += 1;
+        }
+        self.hosts[index].subscribe(name, contract, now);
+        self.settle(index);
+    }
+
+    /// Closes the last reader of an item on a host.
+    pub fn unsubscribe(&mut self, index: usize, name: &ItemName) {
+        let now = self.moment(index);
+        if self.hosts[index].wanted.contains_key(name) {
+            self.reader_left(name);
+        }
+        self.hosts[index].unsubscribe(name, now);
+        self.settle(index);
     }
 
     /// Calls a host's control plane, then does what it asks for.
     pub fn command(&mut self, index: usize, act: impl FnOnce(&mut Catalog, Time)) {
-        let now = self.local(index);
+        let now = self.moment(index);
         if let Some(catalog) = &mut self.hosts[index].catalog {
-            act(catalog, now);
+            act(catalog, now.local);
         }
-        self.drain(index);
-    }
-
-    /// Publishes a sample of an item: each reading host gets it by the paths of its stream, unless it is lost or cut off.
-    pub fn publish(&mut self, index: usize, name: &ItemName, epoch: Epoch, seq: Seq) {
-        let Some(tag) = self.hosts[index].catalog.as_ref().map(Catalog::tag) else {
-            return;
-        };
-        let open = self.hosts[index].open.iter();
-        let routes: Vec<_> = open
-            .filter(|(_, (item, _))| item == name)
-            .map(|(stream, (_, route))| (*stream, route.clone()))
-            .collect();
-        for (stream, route) in routes {
-            let (unicast, group) = match route.path {
-                Path::Unicast => (true, None),
-                Path::Both(group) => (true, Some(group)),
-                Path::Multicast(group) => (false, Some(group)),
-            };
-            for to in 0..self.hosts.len() {
-                let host = &self.hosts[to];
-                if to == index || !host.expected.contains_key(&(tag, stream)) {
-                    continue;
-                }
-                let listed = route.readers.iter().any(|r| r.addr.ip() == host.addr.ip());
-                let joined = group.is_some_and(|g| host.hears_groups && host.joined.contains(&g));
-                let reachable = self.groups[index] == self.groups[to];
-                for by_group in [false, true] {
-                    let sent = if by_group { joined } else { unicast && listed };
-                    if sent && reachable && !self.chance(self.setup.link.loss) {
-                        self.arrive(to, tag, stream, name, (epoch, seq), by_group);
-                    }
-                }
-            }
-        }
+        self.settle(index);
     }
 
     /// Lets virtual time pass.
@@ -353,205 +308,173 @@ impl Sim {
                 }
                 next_check = self.now + 1_000_000;
             }
-            let due = self
-                .queue
-                .peek()
-                .is_some_and(|Reverse((at, _, _))| *at <= end);
-            let next = if due { self.queue.pop() } else { None };
-            let Some(Reverse((at, _, action))) = next else {
+            let next = self.queue.peek_mut();
+            let next = next.filter(|next| next.0.0 <= end);
+            let Some(Reverse((at, _, action))) =
+                next.map(std::collections::binary_heap::PeekMut::pop)
+            else {
                 self.now = end;
                 return holds(self);
             };
             self.now = self.now.max(at);
             match action {
-                Action::Wake(index) => {
-                    if self.hosts[index].wake <= self.now {
-                        self.hosts[index].wake = u64::MAX;
-                    }
-                    self.command(index, |catalog, now| {
-                        catalog.handle_timeout(now);
-                    });
-                }
+                Action::Wake(index) => self.wake(index),
                 Action::Deliver {
                     to,
                     from,
-                    mut bytes,
-                } => {
-                    if self.groups[from] == self.groups[to] && self.hosts[to].catalog.is_some() {
-                        self.delivered += 1;
-                        let addr = self.hosts[from].addr;
-                        self.command(to, |catalog, now| {
-                            catalog.handle_datagram(addr, &mut bytes, now);
-                        });
-                    }
-                }
+                    way,
+                    bytes,
+                } => self.deliver(to, from, way, bytes),
             }
         }
     }
 
-    fn arrive(
-        &mut self,
-        to: usize,
-        tag: Tag,
-        stream: StreamId,
-        name: &ItemName,
-        sample: (Epoch, Seq),
-        by_group: bool,
-    ) {
-        let host = &mut self.hosts[to];
-        host.copies += 1;
-        let held = host.held.entry(name.clone()).or_default();
-        *held = (*held).max(sample);
-        let (epoch, seq) = *held;
-        self.command(to, |catalog, now| {
-            if by_group {
-                catalog.heard_on_group(tag, stream, now);
-            }
-            catalog.holds(tag, stream, epoch, seq, true, now);
-        });
+    fn wake(&mut self, index: usize) {
+        let now = self.moment(index);
+        let host = &mut self.hosts[index];
+        if host.wake <= self.now {
+            host.wake = u64::MAX;
+        }
+        host.handle_timeout(now);
+        self.settle(index);
     }
 
-    /// Sends and notes what a host left, and sets its alarm.
-    fn drain(&mut self, index: usize) {
-        let Some(mut catalog) = self.hosts[index].catalog.take() else {
-            return;
+    fn deliver(&mut self, to: usize, from: usize, way: Way, mut bytes: Vec<u8>) {
+        let now = self.moment(to);
+        let host = &mut self.hosts[to];
+        let listens = match way {
+            Way::Control | Way::Unicast => true,
+            Way::Group(group) => host.hears_groups && host.joined.contains(&group),
         };
-        let mut bytes = Vec::new();
-        while let Some(transmit) = catalog.poll_transmit(&mut bytes) {
-            self.sent_bytes += u64::try_from(bytes.len()).unwrap_or(0);
-            match transmit.to {
-                Dest::Addr(addr) => {
-                    if let Some(to) = self.hosts.iter().position(|host| host.addr == addr) {
-                        self.post(index, to, &bytes);
-                    }
+        if !listens || host.catalog.is_none() || !self.net.reaches(from, to) {
+            return;
+        }
+        self.delivered += 1;
+        match way {
+            Way::Control => {
+                if let Some(catalog) = &mut host.catalog {
+                    let addr = net::address(from, CONTROL_PORT);
+                    catalog.handle_datagram(addr, &mut bytes, now.local);
                 }
+            }
+            Way::Unicast => host.handle_sample(&mut bytes, false, now),
+            Way::Group(_) => host.handle_sample(&mut bytes, true, now),
+        }
+        self.settle(to);
+    }
+
+    /// Does all that a host has to do now, takes what it left, and sets its alarm.
+    fn settle(&mut self, index: usize) {
+        let now = self.moment(index);
+        self.hosts[index].settle(now);
+        self.collect(index);
+        let (local, queued) = self.hosts[index].poll_timeout();
+        let alarm = local.map(|at| {
+            let wait = nanos(at.since(now.local));
+            // A slow clock reaches the instant later than the difference says.
+            self.now.saturating_add(wait + wait / 5_000)
+        });
+        if let Some(wake) = alarm.into_iter().chain(queued).min()
+            && wake < self.hosts[index].wake
+        {
+            self.hosts[index].wake = wake;
+            self.push(wake, Action::Wake(index));
+        }
+    }
+
+    /// Carries and notes what a host left.
+    fn collect(&mut self, index: usize) {
+        let out = std::mem::take(&mut self.hosts[index].out);
+        for (to, bytes) in out.control {
+            self.sent_bytes += u64::try_from(bytes.len()).unwrap_or(0);
+            match to {
+                Dest::Addr(to) => self.send(index, to, &bytes),
                 Dest::Beacon => {
                     for to in (0..self.hosts.len()).filter(|to| *to != index) {
-                        self.post(index, to, &bytes);
+                        self.post(index, to, Way::Control, &bytes);
                     }
                 }
             }
-            bytes.clear();
         }
-        while let Some(event) = catalog.poll_event() {
-            self.note(index, event);
+        for (to, bytes) in out.samples {
+            self.send(index, to, &bytes);
         }
-        if let Some((at, _)) = catalog.poll_timeout() {
-            let wait = at.since(self.local(index)).as_nanos();
-            // A slow clock reaches the instant later than the difference says.
-            let wait = u64::try_from(wait).unwrap_or(u64::MAX / 4);
-            let wake = self.now.saturating_add(wait + wait / 5_000);
-            if wake < self.hosts[index].wake {
-                self.hosts[index].wake = wake;
-                self.push(wake, Action::Wake(index));
+        for (tag, offset) in out.clocks {
+            let other = self.tags.get(&tag).map(|other| self.local(*other));
+            if let Some(other) = other {
+                let truth = i128::from(other.0) - i128::from(self.local(index).0);
+                let error = truth.abs_diff(i128::from(offset.offset_ns));
+                self.clock_estimates += 1;
+                self.clock_errors += u64::from(error > u128::from(offset.bound_ns));
             }
-        }
-        self.hosts[index].catalog = Some(catalog);
-    }
-
-    fn note(&mut self, index: usize, event: Event) {
-        let host = &mut self.hosts[index];
-        match &event {
-            Event::ItemKnown {
-                name, description, ..
-            } => {
-                host.known.insert(name.clone(), description.clone());
-            }
-            Event::ItemGone { name, .. } => {
-                host.known.remove(name);
-            }
-            Event::OpenStream {
-                stream,
-                name,
-                route,
-            } => {
-                host.open.insert(*stream, (name.clone(), route.clone()));
-            }
-            Event::UpdateStream { stream, route } => {
-                if let Some((_, known)) = host.open.get_mut(stream) {
-                    *known = route.clone();
-                }
-            }
-            Event::CloseStream { stream } => {
-                host.open.remove(stream);
-            }
-            Event::Expect {
-                tag, stream, name, ..
-            } => {
-                host.expected.insert((*tag, *stream), name.clone());
-            }
-            Event::Forget { tag, stream } => {
-                host.expected.remove(&(*tag, *stream));
-            }
-            Event::JoinGroup(group) => {
-                host.joined.insert(*group);
-            }
-            Event::LeaveGroup(group) => {
-                host.joined.remove(group);
-            }
-            Event::Clock { tag, offset } => {
-                let other = self.hosts.iter().position(|host| {
-                    host.catalog
-                        .as_ref()
-                        .is_some_and(|catalog| catalog.tag() == *tag)
-                });
-                if let Some(other) = other {
-                    let truth = i128::from(self.local(other).0) - i128::from(self.local(index).0);
-                    let error = truth.abs_diff(i128::from(offset.offset_ns));
-                    self.clock_estimates += 1;
-                    self.clock_errors += u64::from(error > u128::from(offset.bound_ns));
-                }
-                return;
-            }
-            Event::Held { .. } => return,
-            Event::HostUp { .. }
-            | Event::HostUnreachable { .. }
-            | Event::HostDown { .. }
-            | Event::HostLeft { .. }
-            | Event::PrefixConflict { .. }
-            | Event::Reincarnate { .. }
-            | Event::Session { .. }
-            | Event::SessionClosed { .. } => {}
         }
         let now = self.now();
-        self.log.push((now, index, event));
+        let events = out.events.into_iter().map(|event| (now, index, event));
+        self.log.extend(events);
+        let host = &mut self.hosts[index];
+        let mut broken = std::mem::take(&mut host.broken);
+        let sent = host.data.as_mut();
+        for item in sent
+            .map(|data| std::mem::take(&mut data.tx.sent))
+            .unwrap_or_default()
+        {
+            let interest = self.interest.get(&item);
+            let wanted = interest.is_some_and(|interest| {
+                interest.readers > 0 || self.now <= interest.ended + nanos(LEASE_AT_MOST)
+            });
+            if !wanted {
+                broken.push(format!("`{item}` was sent, and nobody reads it"));
+            }
+        }
+        let broken = broken.into_iter().map(|text| (now, index, text));
+        self.broken.extend(broken);
     }
 
-    fn post(&mut self, from: usize, to: usize, bytes: &[u8]) {
-        if self.groups[from] != self.groups[to] {
+    fn send(&mut self, from: usize, to: SocketAddr, bytes: &[u8]) {
+        if bytes.len() > MAX_DATAGRAM_BYTES {
+            let text = format!("a datagram of {} bytes to {to}", bytes.len());
+            self.broken.push((self.now(), from, text));
+        }
+        if to.ip().is_multicast() {
+            // The sender hears its own, too, if it is a member.
+            for member in 0..self.hosts.len() {
+                self.post(from, member, Way::Group(to), bytes);
+            }
+        } else if let Some((to, way)) = net::socket(to) {
+            self.post(from, to, way, bytes);
+        }
+    }
+
+    fn post(&mut self, from: usize, to: usize, way: Way, bytes: &[u8]) {
+        if !self.net.reaches(from, to) {
             return;
         }
-        let copies = 1 + u8::from(self.chance(self.setup.link.duplicates));
-        for _ in 0..copies {
-            if self.chance(self.setup.link.loss) {
-                continue;
-            }
-            let jitter = self.below(nanos(self.setup.link.jitter).max(1));
-            let at = self.now + nanos(self.setup.link.delay) + jitter;
+        for span in self.net.copies() {
             let bytes = bytes.to_vec();
-            self.push(at, Action::Deliver { to, from, bytes });
+            let action = Action::Deliver {
+                to,
+                from,
+                way,
+                bytes,
+            };
+            self.push(self.now + span, action);
         }
+    }
+
+    fn reader_left(&mut self, name: &ItemName) {
+        if let Some(interest) = self.interest.get_mut(name) {
+            interest.readers = interest.readers.saturating_sub(1);
+            interest.ended = self.now;
+        }
+    }
+
+    fn moment(&self, index: usize) -> host::Moment {
+        self.hosts[index].clock.moment(self.now)
     }
 
     fn push(&mut self, at: u64, action: Action) {
         self.count += 1;
         self.queue.push(Reverse((at, self.count, action)));
-    }
-
-    fn next(&mut self) -> u64 {
-        self.random = self.random.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.random ^ (self.random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, bound: u64) -> u64 {
-        self.next().checked_rem(bound).unwrap_or(0)
-    }
-
-    fn chance(&mut self, share: f64) -> bool {
-        let draw = u32::try_from(self.next() >> 32).unwrap_or(0);
-        f64::from(draw) < share * f64::from(u32::MAX)
     }
 }
 

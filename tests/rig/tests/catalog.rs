@@ -71,7 +71,7 @@ fn hosts_meet_by_beacon_or_seed_and_a_change_is_known_at_once() {
         sim.announce(2, "gps");
         let known = sim.run_until(millis(50), |sim| all_know_one(sim, 2, &name("h2/gps")));
         assert!(known, "seed {seed}: the change is not known everywhere");
-        sim.command(2, |catalog, now| catalog.withdraw(&name("h2/gps"), now));
+        sim.withdraw(2, &name("h2/gps"));
         let gone = sim.run_until(millis(50), |sim| {
             (0..4).all(|i| !sim.host(i).known.contains_key(&name("h2/gps")))
         });
@@ -219,11 +219,9 @@ fn the_last_value_is_reported_held_and_one_copy_serves_many() {
                 && (1..5).all(|i| sim.host(i).expected.len() == 1)
         });
         assert!(open, "seed {seed}: not all readers have the stream");
-        let mut seq = 0;
-        let mut publish_for = |sim: &mut Sim, samples: u64| {
+        let publish_for = |sim: &mut Sim, samples: u64| {
             for _ in 0..samples {
-                seq += 1;
-                sim.publish(0, &item, Epoch(1), Seq(seq));
+                sim.write(0, &item, 64);
                 sim.run_for(millis(10));
             }
         };
@@ -241,13 +239,13 @@ fn the_last_value_is_reported_held_and_one_copy_serves_many() {
             path(&sim)
         );
         if loss == 0.0 {
-            let before: u64 = (1..5).map(|i| sim.host(i).copies).sum();
+            let before: u64 = (1..5).map(|i| sim.host(i).copies()).sum();
             publish_for(&mut sim, 10);
-            let after: u64 = (1..5).map(|i| sim.host(i).copies).sum();
+            let after: u64 = (1..5).map(|i| sim.host(i).copies()).sum();
             assert_eq!(after - before, 40, "seed {seed}: each reader gets one copy");
         }
         for reader in 2..5 {
-            sim.command(reader, |catalog, now| catalog.unsubscribe(&item, now));
+            sim.unsubscribe(reader, &item);
         }
         sim.run_for(if loss == 0.0 { millis(50) } else { secs(4) });
         assert_eq!(
@@ -255,7 +253,7 @@ fn the_last_value_is_reported_held_and_one_copy_serves_many() {
             Some(Path::Unicast),
             "seed {seed}: one reader is left"
         );
-        sim.command(1, |catalog, now| catalog.unsubscribe(&item, now));
+        sim.unsubscribe(1, &item);
         // Under loss every goodbye may be lost, and the lease ends it.
         sim.run_for(if loss == 0.0 { millis(50) } else { secs(4) });
         assert!(sim.host(0).open.is_empty(), "seed {seed}: nobody reads");
@@ -276,8 +274,8 @@ fn a_host_that_is_deaf_to_groups_brings_unicast_back() {
             sim.subscribe(reader, &item, Contract::default());
         }
         sim.run_for(secs(1));
-        for seq in 1..=400 {
-            sim.publish(0, &item, Epoch(1), Seq(seq));
+        for _ in 0..400 {
+            sim.write(0, &item, 64);
             sim.run_for(millis(10));
         }
         let route = sim
@@ -288,8 +286,8 @@ fn a_host_that_is_deaf_to_groups_brings_unicast_back() {
             .map(|(_, route)| route.path);
         assert_eq!(route, Some(Path::Unicast), "seed {seed}");
         assert_eq!(
-            sim.host(2).held.get(&item),
-            Some(&(Epoch(1), Seq(400))),
+            sim.host(2).held(&item),
+            Some((Epoch::new(1, 1), Seq(400))),
             "seed {seed}"
         );
     }

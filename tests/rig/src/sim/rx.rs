@@ -1,0 +1,198 @@
+//! The receiving half of a simulated host: drives a [`Receiver`] as the daemon's thread does, and judges each sample.
+
+use std::collections::BTreeMap;
+
+use ddx_catalog::delivery::{Books, Received, Receiver, ReceiverConfig};
+use ddx_wire::seal::KeyId;
+use ddx_wire::{ClockOffset, Epoch, ItemName, Seq, StreamId, Tag, Time};
+
+use super::HostClock;
+use super::store::Told;
+
+/// Number of a mirror.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct MirrorId(pub(super) u64);
+
+pub(super) struct Rx {
+    pub(super) receiver: Receiver,
+    pub(super) mirrors: BTreeMap<MirrorId, Mirror>,
+    streams: BTreeMap<(Tag, StreamId), Stream>,
+    clocks: BTreeMap<Tag, (ClockOffset, Time)>,
+    /// The newest that was ever shown of an item of each host, while a reader stays.
+    shown: BTreeMap<(ItemName, u64), (Epoch, Seq)>,
+    clock: HostClock,
+    /// Promises that were broken.
+    pub(super) broken: Vec<String>,
+    /// Samples shown to readers.
+    pub(super) shown_samples: u64,
+    /// Of these, samples whose age was known.
+    pub(super) known_ages: u64,
+}
+
+pub(super) struct Mirror {
+    pub(super) name: ItemName,
+    pub(super) newest: (Epoch, Seq),
+}
+
+/// A second, plainer account of what came by a stream.
+struct Stream {
+    mirror: MirrorId,
+    newest: Option<(Epoch, Seq)>,
+    expected: u64,
+    delivered: u64,
+}
+
+impl Rx {
+    pub(super) fn new(own: Tag, key: KeyId, clock: HostClock) -> Self {
+        Self {
+            receiver: Receiver::new(ReceiverConfig::new(own, key)),
+            mirrors: BTreeMap::new(),
+            streams: BTreeMap::new(),
+            clocks: BTreeMap::new(),
+            shown: BTreeMap::new(),
+            clock,
+            broken: Vec::new(),
+            shown_samples: 0,
+            known_ages: 0,
+        }
+    }
+
+    pub(super) fn expect(&mut self, tag: Tag, stream: StreamId, mirror: MirrorId) {
+        self.receiver.listen(tag, stream);
+        let fresh = Stream {
+            mirror,
+            newest: None,
+            expected: 0,
+            delivered: 0,
+        };
+        self.streams.entry((tag, stream)).or_insert(fresh).mirror = mirror;
+    }
+
+    pub(super) fn forget(&mut self, tag: Tag, stream: StreamId) {
+        self.check_books(tag, stream);
+        self.receiver.forget(tag, stream);
+        self.streams.remove(&(tag, stream));
+    }
+
+    pub(super) fn set_clock(&mut self, tag: Tag, offset: ClockOffset, now: Time) {
+        self.clocks.insert(tag, (offset, now));
+    }
+
+    pub(super) fn drop_session(&mut self, tag: Tag) {
+        self.receiver.drop_session(tag);
+        self.clocks.remove(&tag);
+        self.streams.retain(|(sender, _), _| *sender != tag);
+    }
+
+    pub(super) fn drop_mirror(&mut self, mirror: MirrorId) {
+        self.mirrors.remove(&mirror);
+        self.streams.retain(|_, stream| stream.mirror != mirror);
+    }
+
+    /// The last reader of an item closed: a later one may begin anywhere.
+    pub(super) fn reader_closed(&mut self, name: &ItemName) {
+        self.shown.retain(|(shown, _), _| shown != name);
+    }
+
+    pub(super) fn handle_datagram(&mut self, datagram: &mut [u8], by_group: bool, now: Time) {
+        self.receiver.handle_datagram(datagram, by_group, now);
+        let mut arrived = Vec::new();
+        while let Some(sample) = self.receiver.poll_sample() {
+            let Received {
+                tag, stream, meta, ..
+            } = sample;
+            arrived.push((tag, stream, meta, sample.payload.to_vec()));
+        }
+        for (tag, stream, meta, payload) in &arrived {
+            let (tag, stream) = (*tag, *stream);
+            self.take(
+                &Received {
+                    tag,
+                    stream,
+                    meta: *meta,
+                    payload,
+                },
+                now,
+            );
+            self.check_books(tag, stream);
+        }
+    }
+
+    /// The books of a stream, when it is expected.
+    pub(super) fn books(&self) -> impl Iterator<Item = Books> {
+        self.streams
+            .keys()
+            .filter_map(|(tag, stream)| self.receiver.books(*tag, *stream))
+    }
+
+    fn take(&mut self, sample: &Received<'_>, now: Time) {
+        let Some(stream) = self.streams.get_mut(&(sample.tag, sample.stream)) else {
+            return;
+        };
+        stream.account(sample);
+        let Some(mirror) = self.mirrors.get_mut(&stream.mirror) else {
+            return;
+        };
+        let newest = (sample.meta.epoch, sample.meta.seq);
+        let Some(told) = Told::read(&mirror.name, sample.payload) else {
+            self.broken.push(format!("`{}` is torn", mirror.name));
+            return;
+        };
+        if (told.epoch, told.seq) != newest {
+            let text = format!("`{}` claims {newest:?}, is {told:?}", mirror.name);
+            self.broken.push(text);
+        }
+        if newest <= mirror.newest {
+            return;
+        }
+        mirror.newest = newest;
+        self.shown_samples += 1;
+        let before = self.shown.insert((mirror.name.clone(), told.owner), newest);
+        if before > Some(newest) {
+            let text = format!("`{}` went back from {before:?} to {newest:?}", mirror.name);
+            self.broken.push(text);
+        }
+        if let Some((clock, since)) = self.clocks.get(&sample.tag) {
+            let clock = clock.aged(now.since(*since));
+            self.known_ages += 1;
+            let published = clock.to_local(sample.meta.publish).min(now);
+            let truth = self.clock.at(told.truth);
+            let error = published.0.abs_diff(truth.0);
+            if error > clock.bound_ns {
+                let text = format!(
+                    "age of `{}` is off by {error} ns, bound {} ns",
+                    mirror.name, clock.bound_ns
+                );
+                self.broken.push(text);
+            }
+        }
+    }
+
+    fn check_books(&mut self, tag: Tag, id: StreamId) {
+        let (Some(stream), Some(books)) =
+            (self.streams.get(&(tag, id)), self.receiver.books(tag, id))
+        else {
+            return;
+        };
+        let delivered = books.delivered == stream.delivered;
+        if !books.balanced() || !delivered || books.expected != stream.expected {
+            self.broken.push(format!(
+                "books of {id:?}: {books:?}, of {} delivered and {} expected",
+                stream.delivered, stream.expected
+            ));
+        }
+    }
+}
+
+impl Stream {
+    fn account(&mut self, sample: &Received<'_>) {
+        let (epoch, Seq(seq)) = (sample.meta.epoch, sample.meta.seq);
+        self.expected += match self.newest {
+            None => 1,
+            Some((last, Seq(from))) if last == epoch => seq - from,
+            Some(_) => seq,
+        };
+        self.newest = Some((epoch, Seq(seq)));
+        self.delivered += 1;
+    }
+}

@@ -1,0 +1,329 @@
+//! Whatever a seed thinks up: hosts, items, readers, links, cuts, restarts; each sample is judged as it passes.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use ddx_rig::sim::{Link, Random, Setup, Sim};
+use ddx_wire::{Contract, ItemName};
+
+use super::{check, ensure, millis, secs, seeds};
+
+/// One item, who writes it and how.
+struct Source {
+    host: usize,
+    rest: String,
+    name: ItemName,
+    period: Duration,
+    len: usize,
+    next: Duration,
+    written: bool,
+}
+
+/// A scenario on its way.
+struct Play {
+    seed: u64,
+    random: Random,
+    sim: Sim,
+    loss: f64,
+    sources: Vec<Source>,
+    ordinals: Vec<u32>,
+    on: Vec<bool>,
+    /// Nothing but writing and reading: counts are exact.
+    calm: bool,
+}
+
+#[test]
+fn promises_hold_whatever_happens() {
+    let test = "chance::promises_hold_whatever_happens";
+    seeds::run(test, 0..seeds::count(1_000), play);
+}
+
+fn play(seed: u64) -> Result<(), String> {
+    let mut play = Play::new(seed);
+    play.run_for(secs(3));
+    let steps = 8 + play.random.below(12);
+    for _ in 0..steps {
+        if !play.calm {
+            play.disturb();
+        }
+        play.change_reader();
+        let span = millis(20 + play.random.below(900));
+        play.run_for(span);
+    }
+    play.repair();
+    play.run_for(secs(6));
+    play.ends_with_the_newest("after the last write")?;
+    play.exact()?;
+    if !play.calm {
+        play.cut();
+        let span = millis(200 + play.random.below(13_000));
+        play.run_for(span);
+        play.sim.heal();
+        // Hosts that lost each other meet anew first: at high loss that takes several tries.
+        play.sim.run_for(if play.loss > 0.1 {
+            secs(5)
+        } else {
+            Duration::ZERO
+        });
+        play.ends_with_the_newest("after the heal")?;
+    }
+    play.silence()?;
+    check(&play.sim).map_err(|text| format!("{}: {text}", play.describe()))
+}
+
+impl Play {
+    fn new(seed: u64) -> Self {
+        let mut random = Random::new(seed ^ 0xc0ff_ee00);
+        let hosts = 2 + random.index(4);
+        let loss = random.pick(&[0.0, 0.0, 0.02, 0.1, 0.2, 0.33]);
+        let calm = loss == 0.0 && random.chance(0.6);
+        let link = Link {
+            loss,
+            duplicates: if calm {
+                0.0
+            } else {
+                random.pick(&[0.0, 0.02, 0.2])
+            },
+            delay: Duration::from_micros(random.below(4_000)),
+            // What is overtaken while its path changes counts as lost.
+            jitter: if calm {
+                Duration::ZERO
+            } else {
+                Duration::from_micros(random.pick(&[0, 300, 4_000, 12_000]))
+            },
+        };
+        let setup = Setup {
+            seed,
+            hosts,
+            link,
+            beacon: random.chance(0.7),
+            drift_ppm: u32::try_from(random.below(100)).unwrap(),
+            lag: if calm {
+                Duration::ZERO
+            } else {
+                Duration::from_micros(random.below(1_500))
+            },
+        };
+        let mut play = Self {
+            seed,
+            sim: Sim::new(setup),
+            loss,
+            sources: Vec::new(),
+            ordinals: vec![1; hosts],
+            on: vec![true; hosts],
+            calm,
+            random,
+        };
+        for host in 0..hosts {
+            for item in 0..1 + play.random.below(3) {
+                let rest = format!("i{item}");
+                let name = play.sim.announce(host, &rest);
+                let period = millis(play.random.pick(&[5, 20, 50, 110, 700]));
+                let len = play
+                    .random
+                    .pick(&[48, 200, 1_100, 1_200, 5_000, 5_000, 40_000]);
+                play.sources.push(Source {
+                    host,
+                    rest,
+                    name,
+                    period: if len > 10_000 {
+                        period.max(millis(100))
+                    } else {
+                        period
+                    },
+                    len,
+                    next: play.sim.now(),
+                    written: false,
+                });
+            }
+        }
+        for _ in 0..hosts * 3 {
+            play.change_reader();
+        }
+        play
+    }
+
+    fn describe(&self) -> String {
+        format!(
+            "{} hosts, loss {}, calm {}, at {:?}",
+            self.on.len(),
+            self.loss,
+            self.calm,
+            self.sim.now()
+        )
+    }
+
+    /// Lets time pass while programs write.
+    fn run_for(&mut self, span: Duration) {
+        let end = self.sim.now() + span;
+        loop {
+            let next = self.sources.iter_mut().min_by_key(|source| source.next);
+            let Some(source) = next.filter(|source| source.next < end) else {
+                break;
+            };
+            let now = self.sim.now();
+            self.sim.run_for(source.next.saturating_sub(now));
+            source.next = source.next.max(now) + source.period;
+            source.written = self
+                .sim
+                .write(source.host, &source.name, source.len)
+                .is_some();
+        }
+        self.sim.run_for(end.saturating_sub(self.sim.now()));
+    }
+
+    fn contract(&mut self) -> Contract {
+        let rate = self.random.pick(&[0.0, 0.0, 0.0, 1.0, 7.0, 30.0]);
+        Contract::at_most_hz(rate).unwrap_or_default()
+    }
+
+    /// Some host opens, changes or closes a reader.
+    fn change_reader(&mut self) {
+        let reader = self.random.index(self.on.len());
+        let source = self.random.index(self.sources.len());
+        let source = &self.sources[source];
+        let name = source.name.clone();
+        if source.host == reader {
+            return;
+        }
+        if self.random.chance(0.75) {
+            let contract = self.contract();
+            self.sim.subscribe(reader, &name, contract);
+        } else {
+            self.sim.unsubscribe(reader, &name);
+        }
+    }
+
+    fn disturb(&mut self) {
+        let host = self.random.index(self.on.len());
+        match self.random.below(9) {
+            0 if self.on[host] => {
+                self.on[host] = false;
+                self.sim.kill(host);
+            }
+            0 | 1 => self.restart(host),
+            2 => self.cut(),
+            3 | 4 => self.sim.heal(),
+            5 => self.sim.host_mut(host).hears_groups ^= true,
+            6 => {
+                let source = self.random.index(self.sources.len());
+                self.replace_writer(source);
+            }
+            7 => {
+                let source = self.random.index(self.sources.len());
+                let Source { host, name, .. } = &self.sources[source];
+                self.sim.withdraw(*host, name);
+            }
+            _ => {}
+        }
+    }
+
+    fn replace_writer(&mut self, source: usize) {
+        let Source { host, rest, .. } = &self.sources[source];
+        if self.on[*host] {
+            self.sim.announce(*host, rest);
+        }
+    }
+
+    fn cut(&mut self) {
+        let sides: Vec<usize> = (0..self.on.len()).map(|_| self.random.index(2)).collect();
+        self.sim.cut(|host| sides[host]);
+    }
+
+    /// Ends a life of a host, if it has one, and begins the next: its programs come back with it.
+    fn restart(&mut self, host: usize) {
+        self.on[host] = true;
+        self.ordinals[host] += 1;
+        self.sim.start(host, self.ordinals[host]);
+        let again = self.sources.iter().filter(|source| source.host == host);
+        for source in again.map(|source| source.rest.clone()).collect::<Vec<_>>() {
+            self.sim.announce(host, &source);
+        }
+    }
+
+    /// Undoes all disturbances but deaf networks, which are none.
+    fn repair(&mut self) {
+        self.sim.heal();
+        for host in 0..self.on.len() {
+            if !self.on[host] {
+                self.restart(host);
+            }
+        }
+        for source in 0..self.sources.len() {
+            let Source { host, name, .. } = &self.sources[source];
+            if self.sim.host(*host).newest(name).is_none() {
+                self.replace_writer(source);
+            }
+        }
+        for _ in 0..self.on.len() {
+            self.change_reader();
+        }
+    }
+
+    /// One second after now, without writes, every reader holds the newest value.
+    fn ends_with_the_newest(&mut self, when: &str) -> Result<(), String> {
+        let start = self.sim.now();
+        self.sim.run_for(secs(1));
+        for reader in 0..self.on.len() {
+            for (name, contract) in &self.sim.host(reader).wanted {
+                let mut sources = self.sources.iter();
+                let Source { host, len, .. } = sources.find(|s| s.name == *name).unwrap();
+                let newest = self.sim.host(*host).newest(name);
+                let held = self.sim.host(reader).held(name);
+                // Under a contract the newest may have to wait for its turn.
+                if held != newest && contract.max_rate_mhz.is_none_or(|mhz| mhz > 5_000) {
+                    return Err(format!(
+                        "{}: host {reader} holds {held:?} of `{name}`, {len} bytes, {when} at {start:?}, which is at {newest:?}",
+                        self.describe()
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Without loss nothing is lost, and nothing but first values is repeated.
+    fn exact(&self) -> Result<(), String> {
+        if !self.calm {
+            return Ok(());
+        }
+        for index in 0..self.on.len() {
+            let host = self.sim.host(index);
+            let lost = host.link_lost();
+            ensure(lost == 0, || format!("{}: {lost} lost", self.describe()))?;
+        }
+        Ok(())
+    }
+
+    /// When the last reader closes, sending ends.
+    fn silence(&mut self) -> Result<(), String> {
+        for reader in 0..self.on.len() {
+            let names: BTreeSet<ItemName> = self.sim.host(reader).wanted.keys().cloned().collect();
+            for name in names {
+                self.sim.unsubscribe(reader, &name);
+            }
+        }
+        // Without loss a goodbye arrives; else it is said three times, and the lease ends what nobody heard.
+        let limit = if self.loss == 0.0 {
+            millis(100)
+        } else {
+            millis(3_400)
+        };
+        self.sim.run_for(limit);
+        let before: u64 = (0..self.on.len())
+            .map(|i| self.sim.host(i).sent().datagrams)
+            .sum();
+        self.run_for(secs(1));
+        let after: u64 = (0..self.on.len())
+            .map(|i| self.sim.host(i).sent().datagrams)
+            .sum();
+        ensure(before == after, || {
+            format!(
+                "{}: {} data datagrams for nobody (seed {})",
+                self.describe(),
+                after - before,
+                self.seed
+            )
+        })
+    }
+}
