@@ -30,9 +30,11 @@
 //!     let mut writer = store.writer::<Pose>("pose")?;
 //!     let mut reader = store.reader::<Pose>("robot1/pose")?;
 //!     writer.write(&Pose { x: 1.0, y: 2.0 })?;
-//!     let sample = reader.next(Duration::from_secs(1))?.expect("it was just written");
-//!     assert_eq!(sample.value, Pose { x: 1.0, y: 2.0 });
-//!     println!("{} old", sample.meta.age(ddx_store::now()));
+//!     let sample = reader.next(Duration::from_secs(1))?;
+//!     assert_eq!(sample.as_ref().map(|sample| sample.value), Some(Pose { x: 1.0, y: 2.0 }));
+//!     if let Some(sample) = sample {
+//!         println!("{} old", sample.meta.age(ddx_store::now()));
+//!     }
 //!     stop.store(true, std::sync::atomic::Ordering::Relaxed);
 //!     Ok(())
 //! })

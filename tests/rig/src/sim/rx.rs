@@ -129,7 +129,10 @@ impl Rx {
         let Some(stream) = self.streams.get_mut(&(sample.tag, sample.stream)) else {
             return;
         };
-        stream.account(sample);
+        if !stream.account(sample) {
+            let text = format!("stream {:?} went back to {:?}", sample.stream, sample.meta);
+            self.broken.push(text);
+        }
         let Some(mirror) = self.mirrors.get_mut(&stream.mirror) else {
             return;
         };
@@ -185,14 +188,17 @@ impl Rx {
 }
 
 impl Stream {
-    fn account(&mut self, sample: &Received<'_>) {
+    /// Takes in what the receiver handed out. `false` unless it is newer than all before.
+    fn account(&mut self, sample: &Received<'_>) -> bool {
         let (epoch, Seq(seq)) = (sample.meta.epoch, sample.meta.seq);
+        let newer = Some((epoch, Seq(seq))) > self.newest;
         self.expected += match self.newest {
             None => 1,
-            Some((last, Seq(from))) if last == epoch => seq - from,
+            Some((last, Seq(from))) if last == epoch => seq.saturating_sub(from),
             Some(_) => seq,
         };
         self.newest = Some((epoch, Seq(seq)));
         self.delivered += 1;
+        newer
     }
 }
