@@ -82,27 +82,32 @@ fn forged_and_replayed_datagrams_are_counted_and_the_true_ones_arrive() {
 
 #[test]
 fn two_hosts_with_one_prefix_are_both_listed_and_read() {
-    let first = Daemon::start("robot1", Some('1'), &[]);
-    let join = format!("udp/{}", first.control());
-    let second = Daemon::start("robot1", Some('1'), &["--join", &join]);
+    let one = Daemon::start("robot1", Some('1'), &[]);
+    let join = format!("udp/{}", one.control());
+    let other = Daemon::start("robot1", Some('1'), &["--join", &join]);
     let base = Daemon::start("base", Some('1'), &["--join", &join]);
-    for (daemon, value) in [(&first, "1"), (&second, "2")] {
+    for (daemon, value) in [(&one, "1"), (&other, "2")] {
         let put = daemon.ddx(&["put", "n", value, "--type", "u64"]);
         assert_eq!(code(&put), 0, "{}", text(&put.stderr));
     }
-    let id = second.item("@/self")["id"].as_str().unwrap().to_owned();
-    let other = format!("robot1~{}/n", &id[..4]);
+    // They came within a second, so that the lower id keeps the prefix.
+    let id = |daemon: &Daemon| daemon.item("@/self")["id"].as_str().unwrap().to_owned();
+    let (keeper, loser) = if id(&one) < id(&other) {
+        (&one, &other)
+    } else {
+        (&other, &one)
+    };
+    let moved = format!("robot1~{}/n", &id(loser)[..4]);
 
     base.wait_until("both items are listed", |daemon| {
         let listed = daemon.ddx(&["ls"]);
         let listed = text(&listed.stdout);
-        listed.contains("robot1/n") && listed.contains(&other)
+        listed.contains("robot1/n") && listed.contains(&moved)
     });
 
-    // Who came first keeps the prefix, and its own names are what each host says.
-    assert_eq!(base.item("robot1/n"), 1);
-    assert_eq!(base.item(&other), 2);
-    assert_eq!(second.item("n"), 2);
+    assert_eq!(base.item("robot1/n"), keeper.item("n"));
+    assert_eq!(base.item(&moved), loser.item("n"));
+    assert_ne!(base.item("robot1/n"), base.item(&moved));
 }
 
 /// Passes datagrams between two hosts, each once damaged, once whole and once again, until the test's process ends.

@@ -56,7 +56,8 @@ pub(super) struct Network {
     hosts: BTreeMap<HostId, HostName>,
     /// Texts of the schemas of this host's items.
     schemas: BTreeMap<ItemName, String>,
-    remote: BTreeMap<ItemName, RemoteItem>,
+    /// Items of other hosts. Until it is known which of two hosts keeps a prefix, both may show one name.
+    remote: BTreeMap<(ItemName, HostId), RemoteItem>,
     remote_changed: bool,
     mirrors: BTreeMap<ItemName, Mirror>,
     last_mirror: u64,
@@ -389,12 +390,14 @@ impl Network {
                     },
                     schema: schema_text.to_string(),
                 };
-                self.remote.insert(name, item);
+                self.remote.insert((name, host), item);
                 self.remote_changed = true;
             }
-            Event::ItemGone { name, .. } => {
-                self.remote_changed |= self.remote.remove(&name).is_some();
-                self.drop_mirror(&name)?;
+            Event::ItemGone { host, name } => {
+                self.remote_changed |= self.remote.remove(&(name.clone(), host)).is_some();
+                if self.remote_named(&name).next().is_none() {
+                    self.drop_mirror(&name)?;
+                }
             }
             Event::Session { tag, opener, .. } => {
                 self.rx.order(rx::Order::Session { tag, opener })?;
@@ -523,8 +526,8 @@ impl Network {
         stream: (Tag, StreamId),
     ) -> anyhow::Result<MirrorId> {
         let text = self
-            .remote
-            .get(name)
+            .remote_named(name)
+            .find(|item| item.description.schema_hash == description.schema_hash)
             .map(|item| item.schema.as_str())
             .context("its schema is not known")?;
         let schema = Schema::parse(text).context("its owner's schema")?;
@@ -556,6 +559,13 @@ impl Network {
             Some(mirror) => self.rx.order(rx::Order::DropMirror(mirror.id)),
             None => Ok(()),
         }
+    }
+
+    /// What the hosts that show this name say of it.
+    fn remote_named(&self, name: &ItemName) -> impl Iterator<Item = &RemoteItem> {
+        let first = (name.clone(), HostId([0; 16]));
+        let last = (name.clone(), HostId([u8::MAX; 16]));
+        self.remote.range(first..=last).map(|(_, item)| item)
     }
 
     fn host_name(&self, host: HostId) -> HostName {

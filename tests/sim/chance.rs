@@ -16,7 +16,6 @@ struct Source {
     period: Duration,
     len: usize,
     next: Duration,
-    written: bool,
 }
 
 /// A scenario on its way.
@@ -133,7 +132,6 @@ impl Play {
                     },
                     len,
                     next: play.sim.now(),
-                    written: false,
                 });
             }
         }
@@ -164,10 +162,7 @@ impl Play {
             let now = self.sim.now();
             self.sim.run_for(source.next.saturating_sub(now));
             source.next = source.next.max(now) + source.period;
-            source.written = self
-                .sim
-                .write(source.host, &source.name, source.len)
-                .is_some();
+            self.sim.write(source.host, &source.name, source.len);
         }
         self.sim.run_for(end.saturating_sub(self.sim.now()));
     }
@@ -207,7 +202,13 @@ impl Play {
             5 => self.sim.host_mut(host).hears_groups ^= true,
             6 => {
                 let source = self.random.index(self.sources.len());
+                let Source {
+                    host, name, len, ..
+                } = &self.sources[source];
+                // The last of one writer and the first of the next may overtake each other.
+                self.sim.write(*host, name, *len);
                 self.replace_writer(source);
+                self.sources[source].next = self.sim.now();
             }
             7 => {
                 let source = self.random.index(self.sources.len());

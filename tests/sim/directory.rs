@@ -8,7 +8,7 @@ use ddx_rig::sim::{Setup, Sim};
 use super::{check, ensure, millis, secs, seeds};
 
 /// Virtual hours that a pair lives at one third loss, unless `DDX_HOURS` says otherwise.
-const HOURS: u64 = 20;
+const HOURS: u64 = 100;
 
 fn converge(seed: u64, loss: f64, within: Duration) -> Result<(), String> {
     let (hosts, items) = (20, 500);

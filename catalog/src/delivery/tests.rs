@@ -219,6 +219,23 @@ fn sample_written_twice_is_sent_once() {
 }
 
 #[test]
+fn what_is_held_of_a_stream_that_is_never_quiet_is_told_twice_a_second() {
+    let mut sender = sender(Path::Unicast, 1);
+    let mut receiver = receiver();
+    let mut told = Vec::new();
+    for seq in 1..=200 {
+        let now = Time(0) + 10 * MS * u32::try_from(seq).unwrap();
+        let datagrams = write(&mut sender, seq, 10, now);
+        feed(&mut receiver, &datagrams, now);
+        receiver.handle_timeout(now);
+        told.extend(std::iter::from_fn(|| receiver.poll_event()));
+    }
+    let flows = |event: &ReceiverEvent| matches!(event, ReceiverEvent::Flows { .. });
+    assert!(told.iter().all(flows), "{told:?}");
+    assert!((3..=4).contains(&told.len()), "{told:?}");
+}
+
+#[test]
 fn repeat_is_confirmed_at_once_even_when_held_already() {
     let mut sender = sender(Path::Unicast, 1);
     let mut receiver = receiver();
@@ -526,7 +543,10 @@ impl World {
             assert!(self.got.last() < Some(&(epoch, seq)), "out of order");
             self.got.push((epoch, seq));
         }
-        while let Some(ReceiverEvent::Quiet { epoch, seq, .. }) = self.receiver.poll_event() {
+        while let Some(event) = self.receiver.poll_event() {
+            let ReceiverEvent::Quiet { epoch, seq, .. } = event else {
+                continue;
+            };
             let (fate, id) = self.next_fate();
             if !fate.lost {
                 let delay = Duration::from_micros(fate.delay_us);
