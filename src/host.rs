@@ -1,6 +1,6 @@
 //! One host's daemon: the store's server, the control plane, the two data threads, and the loop that joins them.
 //!
-//! The loop is the one place that owns the [`Catalog`]. It makes one mutation, drains all effects, then makes the next.
+//! The loop is the one place that owns the [`Catalog`](ddx_catalog::Catalog). It makes one mutation, drains all effects, then makes the next.
 //! Without a key there is no catalog, no data thread and no socket on any network: the host serves itself.
 
 mod network;

@@ -50,7 +50,7 @@ pub struct Age {
     pub bound: Option<u64>,
 }
 
-/// How far a reader has got: what [`crate::RawReader::after`] goes on from. A default cursor is before everything.
+/// How far a reader has got: what [`crate::RawReader::after_into`] goes on from. A default cursor is before everything.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cursor {
     /// Epoch of the last sample.
