@@ -12,6 +12,7 @@ use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 mod books;
 mod deadlines;
+mod early;
 mod outbox;
 mod pace;
 mod reassembly;

@@ -81,14 +81,19 @@ pub(crate) struct Rx {
 struct State {
     channels: [Channel; 2],
     receiver: Receiver,
+    inbound: Inbound,
+    notices: mailbox::Sender<Notice>,
+    told: Time,
+    spin: bool,
+}
+
+/// Where samples go.
+struct Inbound {
     mirrors: HashMap<MirrorId, Mirror>,
     streams: HashMap<(Tag, StreamId), MirrorId>,
     /// What is known of the senders' clocks, and since when.
     clocks: HashMap<Tag, (ClockOffset, Time)>,
-    notices: mailbox::Sender<Notice>,
     traffic: Arc<Traffic>,
-    told: Time,
-    spin: bool,
 }
 
 struct Mirror {
@@ -113,11 +118,13 @@ impl Rx {
         let mut state = State {
             channels: [Channel::new(data)?, Channel::new(group)?],
             receiver: Receiver::new(config),
-            mirrors: HashMap::new(),
-            streams: HashMap::new(),
-            clocks: HashMap::new(),
+            inbound: Inbound {
+                mirrors: HashMap::new(),
+                streams: HashMap::new(),
+                clocks: HashMap::new(),
+                traffic,
+            },
             notices,
-            traffic,
             told: now,
             spin,
         };
@@ -194,30 +201,17 @@ impl State {
         let Self {
             channels,
             receiver,
-            mirrors,
-            streams,
-            clocks,
-            traffic,
+            inbound,
             ..
         } = self;
         let mut total = 0;
         for _turn in 0..BATCHES_PER_TURN {
             let taken = channels[index].receive(|_from, datagram| {
-                count(&traffic.received_datagrams, 1);
-                count(&traffic.received_bytes, datagram.len());
+                count(&inbound.traffic.received_datagrams, 1);
+                count(&inbound.traffic.received_bytes, datagram.len());
                 let now = ddx_store::now();
                 receiver.handle_datagram(datagram, index == GROUP, now);
-                while let Some(sample) = receiver.poll_sample() {
-                    let mirror = streams
-                        .get(&(sample.tag, sample.stream))
-                        .and_then(|id| mirrors.get_mut(id));
-                    if let Some(mirror) = mirror {
-                        // Nothing may have renewed it since the last stream ended.
-                        let clock = clocks.get(&sample.tag);
-                        let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
-                        mirror.take(&sample, clock.as_ref(), now, traffic);
-                    }
-                }
+                inbound.take(receiver, now);
             });
             match taken {
                 Ok(batch) => {
@@ -240,12 +234,13 @@ impl State {
             Order::Session { tag, opener } => self.receiver.session(tag, opener),
             Order::DropSession(tag) => {
                 self.receiver.drop_session(tag);
-                self.clocks.remove(&tag);
-                self.streams
+                self.inbound.clocks.remove(&tag);
+                self.inbound
+                    .streams
                     .retain(|(sender, _stream), _mirror| *sender != tag);
             }
             Order::Mirror { mirror, writer } => {
-                self.mirrors.insert(
+                self.inbound.mirrors.insert(
                     mirror,
                     Mirror {
                         writer,
@@ -254,23 +249,25 @@ impl State {
                 );
             }
             Order::DropMirror(mirror) => {
-                self.mirrors.remove(&mirror);
-                self.streams.retain(|_key, id| *id != mirror);
+                self.inbound.mirrors.remove(&mirror);
+                self.inbound.streams.retain(|_key, id| *id != mirror);
             }
             Order::Expect {
                 tag,
                 stream,
                 mirror,
             } => {
-                self.receiver.listen(tag, stream);
-                self.streams.insert((tag, stream), mirror);
+                let now = ddx_store::now();
+                self.receiver.listen(tag, stream, now);
+                self.inbound.streams.insert((tag, stream), mirror);
+                self.inbound.take(&mut self.receiver, now);
             }
             Order::Forget { tag, stream } => {
                 self.receiver.forget(tag, stream);
-                self.streams.remove(&(tag, stream));
+                self.inbound.streams.remove(&(tag, stream));
             }
             Order::Clock { tag, offset } => {
-                self.clocks.insert(tag, (offset, ddx_store::now()));
+                self.inbound.clocks.insert(tag, (offset, ddx_store::now()));
             }
             Order::Stop => {}
         }
@@ -313,6 +310,24 @@ impl State {
             self.notices
                 .send(Notice::Counters(Box::new(self.receiver.counters())))
                 .ok();
+        }
+    }
+}
+
+impl Inbound {
+    /// Writes to the mirrors what the receiver has whole.
+    fn take(&mut self, receiver: &mut Receiver, now: Time) {
+        while let Some(sample) = receiver.poll_sample() {
+            let mirror = self
+                .streams
+                .get(&(sample.tag, sample.stream))
+                .and_then(|id| self.mirrors.get_mut(id));
+            if let Some(mirror) = mirror {
+                // Nothing may have renewed it since the last stream ended.
+                let clock = self.clocks.get(&sample.tag);
+                let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
+                mirror.take(&sample, clock.as_ref(), now, &self.traffic);
+            }
         }
     }
 }

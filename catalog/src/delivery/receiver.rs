@@ -10,6 +10,7 @@ use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::{Books, Failure, Ledger, Standing};
 use super::deadlines::Deadlines;
+use super::early::Early;
 use super::reassembly::Reassembly;
 use super::{Received, ReceiverEvent, TimerName};
 
@@ -33,6 +34,7 @@ pub struct Receiver {
     sessions: BTreeMap<Tag, Opener>,
     streams: BTreeMap<(Tag, StreamId), Stream>,
     reassembly: Reassembly,
+    early: Early,
     quiet: Deadlines<(Tag, StreamId)>,
     events: VecDeque<(Tag, StreamId)>,
     on_group: VecDeque<(Tag, StreamId)>,
@@ -51,7 +53,7 @@ pub struct ReceiverCounters {
     pub bytes: u64,
     /// Datagrams dropped, by reason.
     pub refused: RefusedCounts,
-    /// Records of streams that nobody here reads, in datagrams that carry others too.
+    /// Records of streams that nobody here reads: by multicast beside others, or by unicast after the last reader left.
     pub unwanted_records: u64,
     /// Streams not expected because there were too many: their readers get nothing.
     pub refused_streams: u64,
@@ -90,6 +92,7 @@ impl Receiver {
         Self {
             reassembly: Reassembly::new(config.budget_bytes),
             config,
+            early: Early::default(),
             sessions: BTreeMap::new(),
             streams: BTreeMap::new(),
             quiet: Deadlines::new(),
@@ -111,14 +114,23 @@ impl Receiver {
         self.sessions.remove(&tag);
     }
 
-    /// Expects a stream of a sender. One over the limit is not expected, and counted.
-    pub fn listen(&mut self, tag: Tag, stream: StreamId) {
+    /// Expects a stream of a sender, and takes what came of it in the last second, before it was expected. One over the
+    /// limit is not expected, and counted.
+    pub fn listen(&mut self, tag: Tag, stream: StreamId, now: Time) {
         let known = self.streams.contains_key(&(tag, stream));
         if !known && self.streams.len() >= self.config.max_streams {
             self.counters.refused_streams += 1;
             return;
         }
         self.streams.entry((tag, stream)).or_default();
+        if self.ready.is_empty() {
+            self.inbox.clear();
+        }
+        for bytes in self.early.take(tag, stream, now) {
+            for record in Records::new(&bytes).map_while(Result::ok) {
+                self.take(tag, &record, false, now);
+            }
+        }
     }
 
     /// Expects a stream no more, and forgets its order and its books.
@@ -247,7 +259,7 @@ impl Receiver {
         let session = self.sessions.get_mut(&tag).ok_or(Refused::UnknownSender)?;
         // Streams hash into few groups, so many multicast datagrams are for others: they cost no decryption.
         let single = header.stream != MIXED_STREAMS;
-        if single && !self.streams.contains_key(&(tag, header.stream)) {
+        if single && by_group && !self.streams.contains_key(&(tag, header.stream)) {
             return Err(Refused::Unwanted);
         }
         let plaintext: &[u8] = session.open(datagram)?.plaintext;
@@ -266,7 +278,11 @@ impl Receiver {
 
     fn take(&mut self, tag: Tag, record: &Record<'_>, by_group: bool, now: Time) {
         let Some(stream) = self.streams.get_mut(&(tag, record.stream)) else {
-            self.counters.unwanted_records += 1;
+            if by_group {
+                self.counters.unwanted_records += 1;
+            } else {
+                self.counters.unwanted_records += self.early.keep(tag, record, now);
+            }
             return;
         };
         // Also for what came by unicast before: the sender wants to know which way works.

@@ -61,7 +61,7 @@ fn receiver() -> Receiver {
     let mut receiver = Receiver::new(ReceiverConfig::new(READER, domain().id()));
     let opener = Opener::new(&domain(), HOST, LIFE, Purpose::Data);
     receiver.session(sender_tag(), opener);
-    receiver.listen(sender_tag(), STREAM);
+    receiver.listen(sender_tag(), STREAM, Time(0));
     receiver
 }
 
@@ -196,7 +196,7 @@ fn streams_that_share_a_datagram_all_arrive() {
     let other = StreamId(STREAM.0 + 1);
     let route = route(Path::Unicast, 1);
     sender.open(other, route, Time(0));
-    receiver.listen(sender_tag(), other);
+    receiver.listen(sender_tag(), other, Time(0));
     for stream in [STREAM, other] {
         let payload = payload(1, 1, 10);
         sender.write(stream, &meta(1, 1), &payload, Time(0));
@@ -372,7 +372,7 @@ fn only_the_senders_datagrams_are_opened() {
             receiver.session(sender_tag(), opener);
         }
         if expect {
-            receiver.listen(sender_tag(), STREAM);
+            receiver.listen(sender_tag(), STREAM, Time(0));
         }
         receiver.handle_datagram(&mut datagram.clone(), false, Time(0));
         let refused = receiver.counters().refused;
@@ -385,13 +385,33 @@ fn only_the_senders_datagrams_are_opened() {
     let other = DomainKey::from_bytes([5; 32]).id();
     let own = ReceiverConfig::new(sender_tag(), domain().id());
     assert_eq!(reason(good.clone(), true, true), None);
-    assert_eq!(reason(good.clone(), true, false), Some(Refused::Unwanted));
+    assert_eq!(reason(good.clone(), true, false), None);
     assert_eq!(reason(good, false, true), Some(Refused::UnknownSender));
     assert_eq!(
         reason(ReceiverConfig::new(READER, other), true, true),
         Some(Refused::Foreign)
     );
     assert_eq!(reason(own, true, true), Some(Refused::Own));
+}
+
+#[test]
+fn a_value_that_overtakes_the_grant_is_delivered_with_it() {
+    let mut sender = sender(Path::Unicast, 1);
+    let mut datagram = write(&mut sender, 1, 10, Time(0)).remove(0);
+    let mut receiver = Receiver::new(ReceiverConfig::new(READER, domain().id()));
+    let opener = Opener::new(&domain(), HOST, LIFE, Purpose::Data);
+    receiver.session(sender_tag(), opener);
+    let mut by_group = datagram.clone();
+    receiver.handle_datagram(&mut datagram, false, Time(0));
+    assert_eq!(receiver.poll_sample(), None);
+    receiver.listen(sender_tag(), STREAM, Time(0) + MS);
+    assert_eq!(receiver.poll_sample().map(|s| s.meta.seq), Some(Seq(1)));
+    assert_eq!(receiver.counters().unwanted_records, 0);
+    // A group carries the streams of others: what nobody here reads is not even opened.
+    receiver.forget(sender_tag(), STREAM);
+    receiver.handle_datagram(&mut by_group, true, Time(0));
+    let refused = receiver.counters().refused;
+    assert!(refused.iter().any(|entry| entry == (Refused::Unwanted, 1)));
 }
 
 #[test]
@@ -415,7 +435,7 @@ fn tables_of_streams_are_bounded() {
     };
     let mut receiver = Receiver::new(config);
     for stream in [1, 1, 2] {
-        receiver.listen(Tag(1), StreamId(stream));
+        receiver.listen(Tag(1), StreamId(stream), Time(0));
     }
     assert_eq!(receiver.counters().refused_streams, 1);
     let config = SenderConfig {

@@ -438,10 +438,11 @@ impl World {
             Event::Session { tag, opener, .. } => self.receiver.session(tag, opener),
             Event::SessionClosed { tag } => self.receiver.drop_session(tag),
             Event::Expect { tag, stream, .. } => {
-                self.receiver.listen(tag, stream);
+                self.receiver.listen(tag, stream, self.now);
                 if self.receiver.books(tag, stream).is_some() {
                     self.expected.entry((tag, stream)).or_default();
                 }
+                self.settle_samples();
             }
             Event::Forget { tag, stream } => {
                 self.receiver.forget(tag, stream);

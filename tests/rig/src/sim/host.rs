@@ -457,7 +457,7 @@ impl Data {
                 self.rx.mirrors.insert(id, Mirror { name, newest });
             }
             Order::DropMirror(id) => self.rx.drop_mirror(id),
-            Order::Expect(tag, stream, mirror) => self.rx.expect(tag, stream, mirror),
+            Order::Expect(tag, stream, mirror) => self.rx.expect(tag, stream, mirror, now),
             Order::Forget(tag, stream) => self.rx.forget(tag, stream),
             Order::Clock(tag, offset) => {
                 let time = Duration::from_nanos(offset.bound_ns.saturating_mul(2));

@@ -57,8 +57,8 @@ impl Rx {
         }
     }
 
-    pub(super) fn expect(&mut self, tag: Tag, stream: StreamId, mirror: MirrorId) {
-        self.receiver.listen(tag, stream);
+    pub(super) fn expect(&mut self, tag: Tag, stream: StreamId, mirror: MirrorId, now: Time) {
+        self.receiver.listen(tag, stream, now);
         let fresh = Stream {
             mirror,
             newest: None,
@@ -66,6 +66,7 @@ impl Rx {
             delivered: 0,
         };
         self.streams.entry((tag, stream)).or_insert(fresh).mirror = mirror;
+        self.take_arrived(now);
     }
 
     pub(super) fn forget(&mut self, tag: Tag, stream: StreamId) {
@@ -96,6 +97,10 @@ impl Rx {
 
     pub(super) fn handle_datagram(&mut self, datagram: &mut [u8], by_group: bool, now: Time) {
         self.receiver.handle_datagram(datagram, by_group, now);
+        self.take_arrived(now);
+    }
+
+    fn take_arrived(&mut self, now: Time) {
         let mut arrived = Vec::new();
         while let Some(sample) = self.receiver.poll_sample() {
             let Received {
