@@ -74,6 +74,7 @@ mod connection;
 #[doc(hidden)]
 pub mod control;
 mod crash;
+mod descriptor;
 mod error;
 mod life;
 mod quota;

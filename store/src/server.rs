@@ -136,7 +136,7 @@ impl Server {
     /// A connection of this process that is greeted already, although nobody runs the server yet.
     pub(crate) fn adopt_own(&mut self) -> Result<Connection, Error> {
         let (ours, theirs) = socket::pair().map_err(Error::os("make a socket pair"))?;
-        self.adopt(ours, false);
+        self.adopt(ours, None, false);
         Connection::over_pair(theirs, || self.turn(Duration::ZERO))
     }
 }

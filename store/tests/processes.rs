@@ -37,6 +37,7 @@ fn role() {
         }
         "writer" => write_forever(&rig::open(&socket)),
         "reader" => read_forever(&rig::open(&socket)),
+        "parent" => write_and_fork(&rig::open(&socket)),
         other => panic!("no role {other}"),
     }
 }
@@ -49,6 +50,28 @@ fn write_forever(store: &Store) {
             println!("!writing");
         }
         thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Leaves a child that holds the connection open and says nothing.
+fn write_and_fork(store: &Store) {
+    let mut writer = store.writer::<u64>("n").unwrap();
+    writer.write(&1).unwrap();
+    #[expect(unsafe_code, reason = "nothing else forks")]
+    // SAFETY: the child only sleeps, and ends by `_exit`.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        // Its test ends it long before.
+        thread::sleep(LONG);
+        #[expect(unsafe_code, reason = "the child must not run the harness's exit")]
+        // SAFETY: ends the child at once.
+        unsafe {
+            libc::_exit(0)
+        };
+    }
+    println!("!forked {child}");
+    loop {
+        thread::park();
     }
 }
 
@@ -107,6 +130,30 @@ fn a_second_writer_is_told_who_holds_the_item() {
 
     drop(first);
     daemon.store().writer::<u64>("n").unwrap();
+}
+
+#[test]
+fn a_dead_writers_item_is_free_at_once_although_its_child_holds_the_connection() {
+    let daemon = daemon();
+    let store = daemon.store();
+    let mut first = Process::start("parent", &daemon.socket(), &[]);
+    let child = first.wait_for("forked").parse().unwrap();
+    let child = Child(rustix::process::Pid::from_raw(child).unwrap());
+
+    first.kill();
+    let second = store.writer::<u64>("n");
+
+    second.unwrap().write(&2).unwrap();
+    rustix::process::test_kill_process(child.0).expect("the child holds the connection");
+}
+
+/// A grandchild of the test, which ends with it.
+struct Child(rustix::process::Pid);
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        rustix::process::kill_process(self.0, rustix::process::Signal::KILL).ok();
+    }
 }
 
 #[test]

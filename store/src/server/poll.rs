@@ -14,11 +14,14 @@ use super::registry::{ClientId, Effect};
 use super::{Command, Server};
 use crate::clock;
 use crate::control::{Notice, ToClient};
+use crate::descriptor::{PeerProcess, peer_process};
 use crate::error::Error;
 use crate::socket::{self, Incoming};
 
 /// Messages of one client before the others get their turn.
 const TURN_MESSAGES: usize = 32;
+/// Messages of a dead client that are still read: more than its socket holds, should a child that it left go on sending.
+const LAST_MESSAGES: usize = 1024;
 /// Connections taken in one turn.
 const TURN_ACCEPTS: usize = 64;
 /// Longest sleep: how late [`Server::run`] sees a `stop` that nobody woke it for.
@@ -29,10 +32,20 @@ const PAUSE: Duration = Duration::from_millis(5);
 /// Bytes that may wait for one client, beside the limit on their number.
 const QUEUE_BYTES: usize = 4 << 20;
 
+/// What there is to do.
+struct Ready {
+    sockets: Vec<(ClientId, PollFlags)>,
+    /// Clients whose process has ended.
+    dead: Vec<ClientId>,
+}
+
 /// One connection.
 #[derive(Debug)]
 pub(super) struct Peer {
     socket: Arc<OwnedFd>,
+    /// Readable when the client's process has ended, although somebody that it left may hold the socket open. None for a
+    /// client in this process, and where the kernel has none: then the end of the connection says so.
+    process: Option<OwnedFd>,
     waiting: VecDeque<Outgoing>,
     waiting_bytes: usize,
 }
@@ -66,7 +79,11 @@ impl Server {
         if self.listener.is_some() && !is_behind {
             self.accept();
         }
-        for (client, flags) in ready {
+        // The dead first: what the living ask for may be what those held.
+        for client in ready.dead {
+            self.read_last(client);
+        }
+        for (client, flags) in ready.sockets {
             if flags.contains(PollFlags::OUT) {
                 self.flush(client);
             }
@@ -79,7 +96,7 @@ impl Server {
     }
 
     /// Takes a connection in. A client too many is told why and dropped.
-    pub(super) fn adopt(&mut self, socket: OwnedFd, privileged: bool) {
+    pub(super) fn adopt(&mut self, socket: OwnedFd, process: Option<OwnedFd>, privileged: bool) {
         let Ok(pid) = socket::peer_pid(&socket) else {
             return;
         };
@@ -87,6 +104,7 @@ impl Server {
             Ok(client) => {
                 let peer = Peer {
                     socket: Arc::new(socket),
+                    process,
                     waiting: VecDeque::new(),
                     waiting_bytes: 0,
                 };
@@ -102,11 +120,7 @@ impl Server {
         }
     }
 
-    fn wait(
-        &self,
-        timeout: Duration,
-        is_behind: bool,
-    ) -> Result<Vec<(ClientId, PollFlags)>, Error> {
+    fn wait(&self, timeout: Duration, is_behind: bool) -> Result<Ready, Error> {
         let mut fds = vec![PollFd::new(&*self.handle.wake, PollFlags::IN)];
         let listener = self.listener.as_ref().filter(|_| !self.accept_pause);
         fds.extend(listener.map(|listener| PollFd::new(listener, PollFlags::IN)));
@@ -117,6 +131,14 @@ impl Server {
             flags.set(PollFlags::OUT, !peer.waiting.is_empty());
             fds.push(PollFd::new(&*peer.socket, flags));
         }
+        // After the sockets: a death that came before a message is seen with it.
+        let mut watched = Vec::new();
+        for (client, peer) in &self.peers {
+            if let Some(process) = peer.process.as_ref().filter(|_| !is_behind) {
+                fds.push(PollFd::new(process, PollFlags::IN));
+                watched.push(*client);
+            }
+        }
         let polled = rustix::event::poll(&mut fds, Some(&socket::timespec(timeout)));
         match polled {
             Ok(_) | Err(rustix::io::Errno::INTR) => {}
@@ -125,20 +147,21 @@ impl Server {
         let mut count = [0; 8];
         // Fails when nobody has called, which is as good.
         let _none = rustix::io::read(&self.handle.wake, &mut count);
-        let flags = fds.iter().skip(first).map(PollFd::revents);
-        Ok(self
-            .peers
-            .keys()
-            .copied()
-            .zip(flags)
-            .filter(|(_, flags)| !flags.is_empty())
-            .collect())
+        let mut flags = fds.iter().skip(first).map(PollFd::revents);
+        let sockets = self.peers.keys().copied().zip(flags.by_ref());
+        let sockets = sockets.filter(|(_, flags)| !flags.is_empty()).collect();
+        let dead = watched.into_iter().zip(flags);
+        let dead = dead.filter(|(_, flags)| !flags.is_empty());
+        Ok(Ready {
+            sockets,
+            dead: dead.map(|(client, _)| client).collect(),
+        })
     }
 
     fn take_commands(&mut self) {
         while let Ok(command) = self.commands.try_recv() {
             match command {
-                Command::Adopt { socket, privileged } => self.adopt(socket, privileged),
+                Command::Adopt { socket, privileged } => self.adopt(socket, None, privileged),
                 Command::SetRemote(items) => self.registry.set_remote(items),
                 Command::SetNotes(notes) => self.registry.set_notes(notes),
                 Command::Subscribe(events) => self.events = Some(events),
@@ -156,7 +179,12 @@ impl Server {
                 return;
             };
             match socket::accept(listener) {
-                Ok(Some(socket)) => self.adopt(socket, false),
+                Ok(Some(socket)) => match peer_process(&socket) {
+                    PeerProcess::Watched(process) => self.adopt(socket, Some(process), false),
+                    PeerProcess::Unknown => self.adopt(socket, None, false),
+                    // It has been answered nothing, so it holds nothing.
+                    PeerProcess::Ended => {}
+                },
                 Ok(None) => return,
                 Err(error) => {
                     warn!(%error, "no connection accepted");
@@ -186,6 +214,16 @@ impl Server {
                 }
             }
             self.apply();
+        }
+    }
+
+    /// Takes what a client sent before its process ended, then drops it as if its connection had ended too.
+    fn read_last(&mut self, client: ClientId) {
+        for _ in 0..LAST_MESSAGES / TURN_MESSAGES {
+            self.read(client);
+        }
+        if self.peers.contains_key(&client) {
+            self.drop_peer(client);
         }
     }
 
