@@ -3,28 +3,31 @@
 //! The loop is the one place that owns the [`Catalog`](ddx_catalog::Catalog). It makes one mutation, drains all effects, then makes the next.
 //! Without a key there is no catalog, no data thread and no socket on any network: the host serves itself.
 
+mod keeper;
 mod network;
 mod state;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use anyhow::Context;
 use ddx_store::Quotas;
-use ddx_store::server::{self, Event as StoreEvent, Server, socket_path};
+use ddx_store::server::{self, Event as StoreEvent, Orphan, Server, socket_path};
 use ddx_wire::seal::DomainKey;
 use ddx_wire::{DomainId, HostName};
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::time::{MissedTickBehavior, interval};
 
+use self::keeper::Keeper;
 use self::network::Network;
 use self::state::Publisher;
 use crate::identity::Identity;
+use crate::manager::Manager;
 
 /// How often the daemon's own state is looked at, and written when it changed.
 const STATE_PERIOD: Duration = Duration::from_secs(1);
@@ -89,14 +92,15 @@ pub async fn run(
     let mut shutdown = std::pin::pin!(shutdown);
     let mut ready = Some(ready);
     let mut ordinal_min = 0;
+    let mut left = Left::by_the_former_process()?;
     loop {
         let identity = Identity::take(&config.host, config.domain.0, ordinal_min)?;
-        let mut daemon = Daemon::start(&config, identity)?;
+        let mut daemon = Daemon::start(&config, identity, left)?;
         if let Some(ready) = ready.take() {
             ready(&daemon.ready);
         }
         let ended = daemon.serve(shutdown.as_mut()).await;
-        daemon.stop();
+        left = daemon.stop();
         match ended? {
             Ended::Shutdown => return Ok(()),
             // Programs notice a restarted daemon and hand their segments over, so a new life costs them nothing.
@@ -123,11 +127,30 @@ enum Ended {
     Reincarnate { ordinal: u32 },
 }
 
+/// What one life of the daemon leaves to the next.
+struct Left {
+    /// Items that no program writes.
+    orphans: Vec<Orphan>,
+    /// Who keeps them beyond this process; none without a service manager.
+    keeper: Option<Keeper>,
+}
+
+impl Left {
+    fn by_the_former_process() -> anyhow::Result<Self> {
+        let mut keeper = Manager::from_env()?.map(Keeper::new);
+        Ok(Self {
+            orphans: keeper.as_mut().map(Keeper::inherit).unwrap_or_default(),
+            keeper,
+        })
+    }
+}
+
 struct Daemon {
     ready: Ready,
     handle: server::Handle,
     stopping: Arc<AtomicBool>,
-    server: JoinHandle<Result<(), ddx_store::Error>>,
+    server: JoinHandle<Vec<Orphan>>,
+    keeper: Option<JoinHandle<Keeper>>,
     /// Drains the store's bounded channel at once, so that the control loop may call the store without a deadlock.
     forwarder: JoinHandle<bool>,
     events: tokio::sync::mpsc::UnboundedReceiver<StoreEvent>,
@@ -136,7 +159,7 @@ struct Daemon {
 }
 
 impl Daemon {
-    fn start(config: &Config, identity: Identity) -> anyhow::Result<Self> {
+    fn start(config: &Config, identity: Identity, left: Left) -> anyhow::Result<Self> {
         let socket = config
             .socket
             .clone()
@@ -148,15 +171,35 @@ impl Daemon {
             quotas: config.quotas,
             ..server::Config::new(config.host.clone())
         })?;
+        let refused = keeper::restore(&mut server, left.orphans);
+        let keeper = match left.keeper {
+            Some(mut keeper) => {
+                refused.into_iter().for_each(|epoch| keeper.forget(epoch));
+                let (sender, changes) = mpsc::sync_channel(keeper::CHANGES_MAX);
+                server.keep_orphans(sender);
+                let thread = thread::Builder::new()
+                    .name("ddx-keeper".to_owned())
+                    .spawn(move || keeper.run(changes))
+                    .context("starting the thread that keeps items")?;
+                Some(thread)
+            }
+            None => None,
+        };
         let handle = server.handle();
+        // Asked for before anything happens: the first events are of the items that were restored.
+        let news = handle.events()?;
         let stopping = Arc::new(AtomicBool::new(false));
         let stop = Arc::clone(&stopping);
         let server = thread::Builder::new()
             .name("ddx-store".to_owned())
-            .spawn(move || server.run(&stop))
+            .spawn(move || {
+                if let Err(error) = server.run(&stop) {
+                    tracing::error!(%error, "the store's thread failed");
+                }
+                server.orphans()
+            })
             .context("starting the store's thread")?;
         let (sender, events) = tokio::sync::mpsc::unbounded_channel();
-        let news = handle.events()?;
         let forwarder = thread::Builder::new()
             .name("ddx-events".to_owned())
             .spawn(move || news.into_iter().all(|event| sender.send(event).is_ok()))
@@ -181,6 +224,7 @@ impl Daemon {
             handle,
             stopping,
             server,
+            keeper,
             forwarder,
             events,
             network,
@@ -212,7 +256,7 @@ impl Daemon {
         }
     }
 
-    fn stop(mut self) {
+    fn stop(mut self) -> Left {
         if let Some(network) = self.network.take() {
             network.stop();
         }
@@ -220,14 +264,21 @@ impl Daemon {
         self.stopping.store(true, Ordering::Relaxed);
         self.handle.wake();
         drop(self.handle);
-        match self.server.join() {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => tracing::error!(%error, "the store's thread failed"),
-            Err(_panic) => tracing::error!("the store's thread panicked"),
-        }
+        let orphans = self.server.join().unwrap_or_else(|_panic| {
+            tracing::error!("the store's thread panicked");
+            Vec::new()
+        });
         if self.forwarder.join().is_err() {
             tracing::error!("the thread that forwards the store's news panicked");
         }
+        let keeper = self.keeper.and_then(|keeper| match keeper.join() {
+            Ok(keeper) => Some(keeper),
+            Err(_panic) => {
+                tracing::error!("the thread that keeps items panicked");
+                None
+            }
+        });
+        Left { orphans, keeper }
     }
 }
 

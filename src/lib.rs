@@ -6,6 +6,7 @@ mod data;
 pub mod error;
 pub mod host;
 mod identity;
+mod manager;
 mod net;
 mod source;
 pub mod units;

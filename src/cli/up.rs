@@ -1,7 +1,5 @@
 //! `ddx up`: serves this host in the foreground until SIGTERM or SIGINT.
 
-use std::os::linux::net::SocketAddrExt as _;
-use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
@@ -15,6 +13,7 @@ use super::output::Output;
 use crate::config::Config;
 use crate::error::{Exit, Failure, Hint as _, Outcome};
 use crate::host::{self, Ready};
+use crate::manager::Manager;
 
 /// What overrides the configuration.
 #[derive(Debug, clap::Args)]
@@ -131,38 +130,17 @@ fn announce(out: &mut Output, ready: &Ready) -> anyhow::Result<()> {
             ready.socket.display()
         ),
     )?;
-    match std::env::var("NOTIFY_SOCKET") {
-        Ok(socket) => notify(&socket).with_context(|| format!("tell `{socket}` that we are ready")),
-        Err(_unset) => Ok(()),
+    if let Some(manager) = Manager::from_env()? {
+        manager
+            .ready()
+            .context("tell the service manager that we are ready")?;
     }
-}
-
-/// The service manager's protocol: one datagram to a path or to an abstract socket.
-fn notify(socket: &str) -> std::io::Result<()> {
-    let address = match socket.strip_prefix('@') {
-        Some(name) => SocketAddr::from_abstract_name(name)?,
-        None => SocketAddr::from_pathname(socket)?,
-    };
-    UnixDatagram::unbound()?.send_to_addr(b"READY=1", &address)?;
     Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_service_manager_hears_ready_on_an_abstract_socket() {
-        let name = format!("ddx-notify-{}", std::process::id());
-        let address = SocketAddr::from_abstract_name(&name).unwrap();
-        let manager = UnixDatagram::bind_addr(&address).unwrap();
-
-        notify(&format!("@{name}")).unwrap();
-
-        let mut heard = [0; 16];
-        let len = manager.recv(&mut heard).unwrap();
-        assert_eq!(&heard[..len], b"READY=1");
-    }
 
     #[test]
     fn a_missing_key_file_is_named_with_the_way_to_make_one() {

@@ -11,6 +11,7 @@
 
 pub mod registry;
 
+mod orphan;
 mod poll;
 mod rundir;
 
@@ -24,12 +25,15 @@ use std::time::Duration;
 use ddx_wire::{HostName, ItemName};
 use rustix::event::EventfdFlags;
 
+pub use self::orphan::{Keep, Orphan};
 use self::poll::Peer;
 use self::registry::{ClientId, Identity, Registry};
 pub use self::registry::{Counters, Event, RemoteItem};
 use self::rundir::Claim;
 pub use self::rundir::{run_dir, socket_path};
 use crate::connection::Connection;
+use crate::control::Refusal;
+pub use crate::descriptor::passed_files;
 use crate::error::Error;
 use crate::notify::Bells;
 use crate::quota::Quotas;
@@ -61,6 +65,7 @@ pub struct Server {
     commands: Receiver<Command>,
     handle: Handle,
     events: Option<SyncSender<Event>>,
+    keeper: Option<SyncSender<Keep>>,
     /// Events that found the channel full; clients wait until it has taken them.
     held_back: Vec<Event>,
     accept_pause: bool,
@@ -123,6 +128,7 @@ impl Server {
                 wake: Arc::new(wake),
             },
             events: None,
+            keeper: None,
             held_back: Vec::new(),
             accept_pause: false,
         })
@@ -131,6 +137,23 @@ impl Server {
     /// What other threads talk to this server by.
     pub fn handle(&self) -> Handle {
         self.handle.clone()
+    }
+
+    /// Tells of the items that no program writes, from now on, so that somebody keeps them while there is no daemon. What
+    /// the channel has no room for is not kept.
+    pub fn keep_orphans(&mut self, keeper: SyncSender<Keep>) {
+        self.keeper = Some(keeper);
+    }
+
+    /// The items of this host that no program writes, for the next server.
+    pub fn orphans(&self) -> Vec<Orphan> {
+        self.registry.orphans()
+    }
+
+    /// Takes an item back that a former server left, before anybody is served. Its readers and its writer, should there
+    /// be one, come back to it by themselves.
+    pub fn restore(&mut self, orphan: Orphan) -> Result<(), Refusal> {
+        self.registry.restore(orphan)
     }
 
     /// A connection of this process that is greeted already, although nobody runs the server yet.

@@ -415,7 +415,7 @@ impl Drop for Lease {
 
 /// Copies the item's last value into a new segment, with its old origin.
 fn seed(segment: &mut SegmentWriter, last: &crate::segment::SegmentFds) -> Result<(), Error> {
-    let control = SegmentControl::map(last).map_err(segment_error)?;
+    let control = SegmentControl::map(&last.data, &last.ctl).map_err(segment_error)?;
     let mut payload = Vec::new();
     let Some(stamp) = control.copy_newest(&mut payload) else {
         return Ok(());

@@ -42,7 +42,7 @@ impl Shared {
 
     fn control(&self) -> SegmentControl {
         match self {
-            Self::Memfd(fds) => SegmentControl::map(fds).unwrap(),
+            Self::Memfd(fds) => SegmentControl::map(&fds.data, &fds.ctl).unwrap(),
             Self::Heap(segment) => SegmentControl::heap(segment).unwrap(),
         }
     }

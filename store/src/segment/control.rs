@@ -1,11 +1,12 @@
 //! The daemon's side of a segment: judging what a writer sent, telling its readers what became of it, and clearing
 //! up after dead ones.
 
+use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
 use ddx_wire::Epoch;
 
-use super::{HeapSegment, SegmentError, SegmentFds, Stamp, State};
+use super::{HeapSegment, SegmentError, Stamp, State};
 use crate::layout::{self, Header, MAX_PINS, Shape, Spec};
 use crate::notify::Bells;
 use crate::ring::{Words, load_stamp, peek, slot_is_intact, waiting_bells, waiting_now};
@@ -22,8 +23,8 @@ pub struct SegmentControl {
 
 impl SegmentControl {
     /// Maps and judges a segment that a writer has sent: seals, sizes, header.
-    pub fn map(fds: &SegmentFds) -> Result<Self, SegmentError> {
-        let (data, ctl) = map_both(fds)?;
+    pub fn map(data: &OwnedFd, ctl: &OwnedFd) -> Result<Self, SegmentError> {
+        let (data, ctl) = map_both(data, ctl)?;
         Self::over(Arc::new(data), Arc::new(ctl))
     }
 
@@ -131,10 +132,10 @@ impl SegmentControl {
 }
 
 /// Maps both files of a segment as everybody but its writer does.
-pub(super) fn map_both(fds: &SegmentFds) -> Result<(Map, Map), ShmError> {
+pub(super) fn map_both(data: &OwnedFd, ctl: &OwnedFd) -> Result<(Map, Map), ShmError> {
     use memfd::{Access, CTL_SEALS, DATA_SEALS, map};
-    let data = map(&fds.data, "data", DATA_SEALS, Access::ReadOnly)?;
-    let ctl = map(&fds.ctl, "ctl", CTL_SEALS, Access::ReadWrite)?;
+    let data = map(data, "data", DATA_SEALS, Access::ReadOnly)?;
+    let ctl = map(ctl, "ctl", CTL_SEALS, Access::ReadWrite)?;
     Ok((data, ctl))
 }
 

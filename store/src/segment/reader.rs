@@ -67,7 +67,7 @@ impl SegmentReader {
     /// Maps a segment that its writer has made, and takes the seat. Refuses files that are not sealed, headers that
     /// do not fit their files, and a seat outside the segment.
     pub fn map(fds: &SegmentFds, seat: Seat) -> Result<Self, SegmentError> {
-        let (data, ctl) = map_both(fds)?;
+        let (data, ctl) = map_both(&fds.data, &fds.ctl)?;
         Self::over(Arc::new(data), Arc::new(ctl), seat)
     }
 

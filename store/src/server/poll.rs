@@ -246,6 +246,13 @@ impl Server {
                     self.flush(client);
                     self.peers.remove(&client);
                 }
+                Effect::Keep(keep) => {
+                    if let Some(keeper) = &self.keeper
+                        && let Err(TrySendError::Full(keep)) = keeper.try_send(keep)
+                    {
+                        warn!(%keep, "this is not told to whoever keeps it");
+                    }
+                }
                 Effect::Event(event) => {
                     debug!(?event, "store");
                     if self.events.is_some() {

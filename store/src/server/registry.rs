@@ -7,6 +7,7 @@
 mod item;
 mod lease;
 mod listing;
+mod orphan;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::OwnedFd;
@@ -15,6 +16,7 @@ use std::sync::Arc;
 use ddx_wire::{Contract, Epoch, HostName, ItemDescription, ItemName, Time};
 
 use self::item::{Item, Reader};
+use super::orphan::Keep;
 use crate::control::{
     Notice, Refusal, Reply, Request, SCHEMA_MAX_BYTES, ToClient, ToDaemon, VERSION,
 };
@@ -58,6 +60,8 @@ pub enum Effect {
     },
     /// Tell the daemon.
     Event(Event),
+    /// Tell whoever keeps what outlives the daemon.
+    Keep(Keep),
 }
 
 /// What happens among the items of a host, as far as other hosts are concerned.

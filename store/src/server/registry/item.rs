@@ -11,7 +11,7 @@ use crate::layout::{BASE_PINS, MAX_PINS};
 use crate::notify::{Bell, DIRTY_BITS};
 use crate::quota::Limit;
 use crate::schema::Schema;
-use crate::segment::{Seat, SegmentControl, SegmentFds};
+use crate::segment::{Seat, SegmentControl};
 
 /// A name that is written, was written, or is waited for.
 #[derive(Debug, Default)]
@@ -135,11 +135,16 @@ impl Segment {
         let Ok([data, ctl]) = <[OwnedFd; 2]>::try_from(fds) else {
             return Err(Refusal::Segment("two descriptors expected".to_owned()));
         };
-        let fds = SegmentFds { data, ctl };
-        let control = SegmentControl::map(&fds).map_err(|e| Refusal::Segment(e.to_string()))?;
+        Self::map(Arc::new(data), Arc::new(ctl))
+    }
+
+    /// The same for files that somebody else holds too.
+    pub(super) fn map(data: Arc<OwnedFd>, ctl: Arc<OwnedFd>) -> Result<Self, Refusal> {
+        let control =
+            SegmentControl::map(&data, &ctl).map_err(|e| Refusal::Segment(e.to_string()))?;
         Ok(Self {
-            data: Arc::new(fds.data),
-            ctl: Arc::new(fds.ctl),
+            data,
+            ctl,
             control,
             reserved: 0,
         })

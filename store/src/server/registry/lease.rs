@@ -151,6 +151,9 @@ impl Registry {
         }
         self.refund(client, lease.bytes);
         if changed && is_own {
+            if lease.purpose == Purpose::Write {
+                self.keep(name, WriterState::Orphaned);
+            }
             self.tell_changed(name);
         }
         self.forget_if_empty(name);
@@ -260,6 +263,7 @@ impl Registry {
         for (client, handle) in told {
             self.notify(client, handle, Notice::Removed, Vec::new());
         }
+        self.release_former(&name, &tenure);
         if !name.is_admin() {
             self.event(Event::Withdrawn { name: name.clone() });
         }
@@ -279,6 +283,7 @@ impl Registry {
         let Some(lease) = &item.lease else {
             return;
         };
+        let is_put = lease.purpose == Purpose::Put;
         let spec = segment.control.spec();
         let tenure = Tenure {
             segment,
@@ -326,8 +331,15 @@ impl Registry {
         }
         crate::crash::point("handover.told");
         // Last, so that whoever sees the mark finds the notice in its socket.
-        if let Some(former) = former {
+        if let Some(former) = &former {
             former.segment.control.set_state(SUPERSEDED, &self.bells);
+        }
+        // The value is there already, and the daemon is its writer of record.
+        if is_put {
+            self.keep(name, WriterState::Daemon);
+        }
+        if let Some(former) = &former {
+            self.release_former(name, former);
         }
         if is_same_kind {
             self.tell_changed(name);
@@ -397,7 +409,7 @@ impl Registry {
         }
     }
 
-    fn foreign(&self, name: ItemName) -> Refusal {
+    pub(super) fn foreign(&self, name: ItemName) -> Refusal {
         Refusal::ForeignPrefix {
             hint: name.to_string(),
             host: self.identity.host.clone(),
@@ -442,7 +454,7 @@ impl Registry {
         }
     }
 
-    fn tell_announced(&mut self, name: &ItemName) {
+    pub(super) fn tell_announced(&mut self, name: &ItemName) {
         let Some(description) = self.own_description(name) else {
             return;
         };

@@ -5,6 +5,7 @@ use ddx_wire::{SchemaHash, WriterState};
 use super::*;
 use crate::control::{MESSAGE_MAX_BYTES, Purpose};
 use crate::segment::{SegmentFds, SegmentWriter, Spec};
+use crate::server::Orphan;
 
 struct Bench {
     registry: Registry,
@@ -13,11 +14,15 @@ struct Bench {
 
 impl Bench {
     fn new(quotas: Quotas) -> Self {
+        Self::in_life(3, quotas)
+    }
+
+    fn in_life(ordinal: u32, quotas: Quotas) -> Self {
         let (bells, fd) = Bells::create().unwrap();
         let identity = Identity {
             host: HostName::parse("host").unwrap(),
             domain: 0,
-            ordinal: 3,
+            ordinal,
             quotas,
         };
         Self {
@@ -87,6 +92,16 @@ impl Bench {
         self.ask(client, request, vec![])
     }
 
+    /// What the keeper was told, in order.
+    fn kept(&mut self) -> Vec<Keep> {
+        std::iter::from_fn(|| self.registry.poll_effect())
+            .filter_map(|effect| match effect {
+                Effect::Keep(keep) => Some(keep),
+                Effect::Send { .. } | Effect::Disconnect { .. } | Effect::Event(_) => None,
+            })
+            .collect()
+    }
+
     fn notices(&mut self) -> Vec<(ClientId, u32, Notice)> {
         std::iter::from_fn(|| self.registry.poll_effect())
             .filter_map(|effect| match effect {
@@ -95,7 +110,10 @@ impl Bench {
                     message: ToClient::Notice { handle, notice },
                     ..
                 } => Some((client, handle, notice)),
-                Effect::Send { .. } | Effect::Disconnect { .. } | Effect::Event(_) => None,
+                Effect::Send { .. }
+                | Effect::Disconnect { .. }
+                | Effect::Event(_)
+                | Effect::Keep(_) => None,
             })
             .collect()
     }
@@ -260,4 +278,128 @@ fn a_description_fits_one_message_whatever_others_have_said() {
         let len = ToClient::Reply { serial: 1, reply }.encode().unwrap().len();
         assert!(len <= MESSAGE_MAX_BYTES, "`{name}`: {len} bytes");
     }
+}
+
+/// The orphan of `n` that a registry of life 3 has told its keeper of, and that registry.
+fn orphan() -> (Bench, Orphan) {
+    let mut bench = Bench::new(Quotas::default());
+    let client = bench.client();
+    let epoch = epoch_of(&bench.open_writer(client, 1));
+    bench.commit(client, 1, epoch);
+    bench.registry.disconnect(client);
+    let [Keep::Hold(orphan)] = &bench.kept()[..] else {
+        panic!("not one orphan");
+    };
+    let orphan = orphan.clone();
+    (bench, orphan)
+}
+
+#[test]
+fn an_orphan_comes_back_in_the_next_life_under_its_own_epoch() {
+    let (_, orphan) = orphan();
+    let files = orphan.files().unwrap();
+    let again = files.iter().rev().map(|file| file.try_clone().unwrap());
+    let read = Orphan::from_files(orphan.epoch(), again.collect()).unwrap();
+
+    let mut next = Bench::in_life(4, Quotas::default());
+    next.registry.restore(read).unwrap();
+
+    let name = ItemName::parse("host/n", &next.registry.identity.host).unwrap();
+    let item = next.registry.describe(&name).unwrap();
+    assert_eq!(item.entry.writer, Some(WriterState::Orphaned));
+    assert_eq!(
+        (item.epoch, item.entry.program.as_str()),
+        (orphan.epoch(), "p")
+    );
+    assert_eq!(next.registry.orphans().len(), 1);
+    let reader = next.client();
+    let bound = next.open_reader(reader, 1);
+    assert!(
+        matches!(
+            bound,
+            Reply::Reader {
+                binding: Some(_),
+                ..
+            }
+        ),
+        "{bound:?}"
+    );
+}
+
+#[test]
+fn an_orphan_gives_way_to_a_writer_that_took_over_before_the_daemon_died() {
+    let (_, orphan) = orphan();
+    let mut next = Bench::in_life(4, Quotas::default());
+    let old = orphan.epoch();
+    next.registry.restore(orphan).unwrap();
+
+    let client = next.client();
+    let later = Epoch(old.0 + 1);
+    let (_, SegmentFds { data, ctl }) = SegmentWriter::create(SPEC, later).unwrap();
+    let request = Request::Resume {
+        handle: 1,
+        name: "host/n".to_owned(),
+        schema: Schema::scalar("u64").unwrap().text().to_owned(),
+    };
+    let resumed = next.ask(client, request, vec![data, ctl]);
+
+    assert_eq!(resumed, Reply::Done);
+    let kept = next.kept();
+    assert!(
+        matches!(kept[..], [Keep::Release(epoch)] if epoch == old),
+        "{kept:?}"
+    );
+}
+
+#[test]
+fn what_was_removed_stays_so_and_its_keeper_is_told() {
+    let (mut bench, orphan) = orphan();
+    let client = bench.client();
+    let name = "n".to_owned();
+
+    bench.ask(client, Request::Remove { name }, vec![]);
+
+    let kept = bench.kept();
+    assert!(
+        matches!(kept[..], [Keep::Release(epoch)] if epoch == orphan.epoch()),
+        "{kept:?}"
+    );
+    let refused = Bench::in_life(4, Quotas::default())
+        .registry
+        .restore(orphan);
+    assert!(
+        refused
+            .unwrap_err()
+            .to_string()
+            .contains("taken over or removed")
+    );
+}
+
+#[test]
+fn an_orphan_that_does_not_fit_is_refused_by_its_fault() {
+    let (mut bench, orphan) = orphan();
+    let mut next = Bench::in_life(4, Quotas::default());
+    let mut refusal = |change: &dyn Fn(&mut Orphan)| {
+        let mut bad = orphan.clone();
+        change(&mut bad);
+        next.registry.restore(bad).unwrap_err().to_string()
+    };
+    let foreign = ItemName::parse("other/n", &bench.registry.identity.host).unwrap();
+
+    let said = refusal(&|bad| bad.label.name = foreign.clone());
+    assert!(said.contains("not under this host's prefix"), "{said}");
+    let said = refusal(&|bad| bad.label.schema = "nonsense".to_owned());
+    assert!(said.contains("schema"), "{said}");
+    let said = refusal(&|bad| bad.label.writer = WriterState::Live);
+    assert!(said.contains("a program writes it"), "{said}");
+    let said = refusal(&|bad| bad.epoch = Epoch(1));
+    assert!(said.contains("another epoch"), "{said}");
+    let said = refusal(&|bad| std::mem::swap(&mut bad.data, &mut bad.ctl));
+    assert!(said.contains("not sealed"), "{said}");
+    assert!(next.registry.items.is_empty());
+    next.registry.restore(orphan.clone()).unwrap();
+    let twice = next.registry.restore(orphan.clone()).unwrap_err();
+    assert!(twice.to_string().contains("a later value"), "{twice}");
+    let same_life = bench.registry.restore(orphan).unwrap_err();
+    assert!(same_life.to_string().contains("later life"), "{same_life}");
 }
