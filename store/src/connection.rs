@@ -140,6 +140,7 @@ impl Connection {
     }
 
     /// Counts this connection's daemons, from 1. A change means new bells.
+    #[inline]
     pub(crate) fn life(&self) -> u64 {
         self.life.load(Ordering::Acquire)
     }
@@ -227,6 +228,7 @@ impl Connection {
     }
 
     /// Comes back to a daemon that was started anew, which costs one load as long as there is none.
+    #[inline]
     pub(crate) fn follow(&self) -> Result<(), Error> {
         self.check_fork()?;
         match &self.daemon {
@@ -235,11 +237,12 @@ impl Connection {
         }
     }
 
+    #[inline]
     pub(crate) fn check_fork(&self) -> Result<(), Error> {
-        if fork::generation() == self.fork {
-            Ok(())
-        } else {
+        if fork::is_past(self.fork) {
             Err(Error::Forked)
+        } else {
+            Ok(())
         }
     }
 
@@ -377,6 +380,7 @@ impl State {
 
 impl Mailbox {
     /// Whether there is news: one load.
+    #[inline]
     pub(crate) fn has_mail(&self) -> bool {
         self.has_mail.load(Ordering::Acquire)
     }

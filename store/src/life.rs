@@ -49,11 +49,13 @@ impl Life {
     }
 
     /// Whether a daemon was started since. Must not be called in a forked child, where the counter is not mapped.
+    #[inline]
     pub(crate) fn has_changed(&self) -> bool {
         self.count() != self.seen.load(Ordering::Relaxed)
     }
 
     /// How many daemons have served the socket.
+    #[inline]
     pub(crate) fn count(&self) -> u64 {
         self.map.load(LINE_WORDS, Ordering::Relaxed)
     }

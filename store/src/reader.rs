@@ -17,7 +17,7 @@ use crate::notify::Bell;
 use crate::recovery::Registration;
 use crate::sample::{After, Cursor, Meta, Missed, Sample};
 use crate::schema::Schema;
-use crate::segment::{Pin, PinError, Seat, SegmentFds, SegmentReader, Stamp};
+use crate::segment::{Copier, Pin, PinError, Seat, SegmentFds, SegmentReader, Stamp};
 use crate::store::unexpected;
 use crate::wait::{Condition, Readiness, Wait, wait};
 use crate::writer::segment_error;
@@ -113,9 +113,15 @@ impl<T: Item> Reader<T> {
     }
 
     /// The newest sample, at once; none before the first.
+    #[inline]
     pub fn current(&mut self) -> Result<Option<Sample<T>>, Error> {
-        let meta = self.raw.read_into(&mut self.payload)?;
-        self.decode(meta)
+        let mut copier = Copier::new(&mut self.payload);
+        if !self.raw.copy_newest(&mut copier)? {
+            return Ok(None);
+        }
+        let meta = self.raw.see(&copier.stamp());
+        let value = T::decode(copier.payload())?;
+        Ok(Some(Sample { value, meta }))
     }
 
     /// The next sample that was not seen yet and is still there. Blocks until there is one, at most `timeout`; then none.
@@ -227,15 +233,43 @@ impl RawReader {
     }
 
     /// Copies the newest sample, at once; none before the first.
+    #[inline]
     pub fn read_into(&mut self, payload: &mut Vec<u8>) -> Result<Option<Meta>, Error> {
-        self.newest(|segment| segment.copy_newest(payload), |stamp| *stamp)
-            .map(|read| read.map(|(_, meta)| meta))
+        let mut copier = Copier::new(payload);
+        if self.copy_newest(&mut copier)? {
+            Ok(Some(self.see(&copier.stamp())))
+        } else {
+            Ok(None)
+        }
+    }
+
+    /// False before the first sample.
+    fn copy_newest(&mut self, copier: &mut Copier<'_>) -> Result<bool, Error> {
+        self.look()?;
+        let Some(Bound { segment, .. }) = &self.bound else {
+            return Ok(false);
+        };
+        match copier.copy_newest(segment) {
+            Ok(()) => Ok(true),
+            Err(PinError::NotYet) => Ok(false),
+            Err(error) => Err(pin_error(error, segment)),
+        }
     }
 
     /// The newest sample in place, at once; none before the first.
     pub fn current_pinned(&mut self) -> Result<Option<RawGuard>, Error> {
-        let read = self.newest(SegmentReader::pin_newest, |pin: &Pin| *pin.stamp())?;
-        Ok(read.map(|(pin, meta)| self.guard(pin, meta)))
+        self.look()?;
+        let Some(Bound { segment, .. }) = &self.bound else {
+            return Ok(None);
+        };
+        match segment.pin_newest() {
+            Ok(pin) => {
+                let meta = self.see(pin.stamp());
+                Ok(Some(self.guard(pin, meta)))
+            }
+            Err(PinError::NotYet) => Ok(None),
+            Err(error) => Err(pin_error(error, segment)),
+        }
     }
 
     /// Copies the next sample that was not seen yet and is still there. Blocks until there is one, at most `timeout`; then
@@ -245,7 +279,12 @@ impl RawReader {
         payload: &mut Vec<u8>,
         timeout: Duration,
     ) -> Result<Option<Meta>, Error> {
-        let read = self.next_with(timeout, |segment, pos| segment.copy(pos, payload), |s| *s)?;
+        let mut copier = Copier::new(payload);
+        let read = |segment: &SegmentReader, pos| {
+            copier.copy(segment, pos)?;
+            Ok(copier.stamp())
+        };
+        let read = self.next_with(timeout, read, |stamp| *stamp)?;
         Ok(read.map(|(_, meta)| meta))
     }
 
@@ -262,28 +301,28 @@ impl RawReader {
         payload: &mut Vec<u8>,
     ) -> Result<(Option<Meta>, Missed), Error> {
         self.look()?;
-        let segment = match &self.bound {
-            Some(bound) => bound.segment.clone(),
-            None => return Ok((None, Missed::default())),
+        let Some(Bound { segment, .. }) = &self.bound else {
+            return Ok((None, Missed::default()));
         };
+        let mut copier = Copier::new(payload);
         let head = segment.head_pos();
         let mut pos = match segment.epoch() == cursor.segment {
             true => cursor.pos.saturating_add(1),
             false => 1,
         };
-        pos = pos.max(oldest(&segment, head));
+        pos = pos.max(oldest(segment, head));
         while pos <= head {
-            match segment.copy(pos, payload) {
+            match copier.copy(segment, pos).map(|()| copier.stamp()) {
                 Ok(stamp) if cursor.is_before(stamp.origin.epoch, stamp.origin.seq) => {
-                    let meta = self.meta(&stamp, &segment);
+                    let meta = meta(&stamp, segment);
                     return Ok((Some(meta), cursor.missed_until(&meta)));
                 }
                 Ok(_) => pos += 1,
                 Err(PinError::Overwritten) => {
-                    pos = (pos + 1).max(oldest(&segment, segment.head_pos()));
+                    pos = (pos + 1).max(oldest(segment, segment.head_pos()));
                 }
                 Err(PinError::NotYet) => break,
-                Err(error) => return Err(pin_error(error, &segment)),
+                Err(error) => return Err(pin_error(error, segment)),
             }
         }
         Ok((None, Missed::default()))
@@ -309,27 +348,17 @@ impl RawReader {
         self.missed
     }
 
-    /// Reads the newest sample by `read`, which gives something that `stamp` finds the stamp of.
-    fn newest<R>(
-        &mut self,
-        mut read: impl FnMut(&SegmentReader) -> Result<R, PinError>,
-        stamp: impl Fn(&R) -> Stamp,
-    ) -> Result<Option<(R, Meta)>, Error> {
-        self.look()?;
-        let Some(bound) = &self.bound else {
-            return Ok(None);
-        };
-        match read(&bound.segment) {
-            Ok(read) => {
-                let meta = self.meta(&stamp(&read), &bound.segment);
-                if self.seen.is_before(meta.epoch, meta.seq) || self.seen.segment != meta.segment {
-                    self.seen = meta.cursor();
-                }
-                Ok(Some((read, meta)))
-            }
-            Err(PinError::NotYet) => Ok(None),
-            Err(error) => Err(pin_error(error, &bound.segment)),
+    /// Moves on to the newest sample of the present segment, unless it was seen before.
+    #[inline]
+    fn see(&mut self, stamp: &Stamp) -> Meta {
+        let (segment, state) = self.bound.as_ref().map_or_else(Default::default, |bound| {
+            (bound.segment.epoch(), bound.segment.state())
+        });
+        let meta = Meta::new(stamp, segment, state.orphaned);
+        if self.seen.is_before(meta.epoch, meta.seq) || self.seen.segment != meta.segment {
+            self.seen = meta.cursor();
         }
+        meta
     }
 
     fn next_with<R>(
@@ -362,7 +391,7 @@ impl RawReader {
             };
             match read_or_next(segment, pos, head, &mut read) {
                 Ok(read) => {
-                    let meta = Meta::new(&stamp(&read), segment.epoch(), segment.state().orphaned);
+                    let meta = meta(&stamp(&read), segment);
                     if self.pass(&meta) {
                         return Ok(Some((read, meta)));
                     }
@@ -425,40 +454,38 @@ impl RawReader {
         head.is_some_and(|head| head >= self.first_unread())
     }
 
-    fn meta(&self, stamp: &Stamp, segment: &SegmentReader) -> Meta {
-        Meta::new(stamp, segment.epoch(), segment.state().orphaned)
-    }
-
     /// Learns of a new segment. Looks at the daemon's socket only when the present one says that there is news, or when
     /// there is none.
     fn look(&mut self) -> Result<(), Error> {
         let is_current = self.bound.as_ref().is_some_and(|bound| {
+    #[inline(always)]
             let state = bound.segment.state();
             !state.superseded && !state.removed
         });
-        if !is_current || self.detached {
-            self.seat.connection.drain()?;
-        } else {
+        if is_current && !self.detached {
             self.seat.connection.follow()?;
         }
-        if self.mailbox.has_mail() {
+        if self.mailbox.has_mail() || self.refused.is_some() {
+        } else {
+            self.seat.connection.drain()?;
             self.take_mail()?;
         }
-        match &self.refused {
-            Some(refusal) => Err(refusal.clone().into()),
-            None => Ok(()),
-        }
+        Ok(())
     }
 
     fn take_mail(&mut self) -> Result<(), Error> {
         match self.mailbox.take() {
+    #[cold]
             Some(Mail::Bound(binding, fds)) => self.bind(&binding, &fds)?,
             Some(Mail::Removed) => self.bound = None,
             Some(Mail::Detached) => self.detached = self.bound.is_some(),
             Some(Mail::Refused(refusal)) => self.refused = Some(refusal),
             None => {}
         }
-        Ok(())
+        match &self.refused {
+            Some(refusal) => Err(refusal.clone().into()),
+            None => Ok(()),
+        }
     }
 
     fn bind(&mut self, binding: &Binding, fds: &SegmentFds) -> Result<(), Error> {
@@ -649,6 +676,12 @@ fn contract(rate: Option<f64>) -> Result<Contract, Error> {
 
 fn pin_error(error: PinError, segment: &SegmentReader) -> Error {
     match error {
+#[inline]
+fn meta(stamp: &Stamp, segment: &SegmentReader) -> Meta {
+    Meta::new(stamp, segment.epoch(), segment.state().orphaned)
+}
+
+#[cold]
         PinError::NoPin => Error::NoPin(segment.pins()),
         PinError::Forked => Error::Forked,
         PinError::Corrupt | PinError::Overwritten | PinError::NotYet => {

@@ -10,9 +10,12 @@
 //! ring. Of two full fences one comes first. If the reader's does, the scan sees the pin; if the writer's does, the
 //! reader sees the slot gone.
 //!
+//! Who only copies a few bytes needs no pin, and looks at the slot's header instead: its position is voided before the slot
+//! is written again, so a copy after which the position is still there is whole ([`glance`]). A writer can overtake such a
+//! copy, but not a pin.
+//!
 //! The pins of readers that keep their quota cannot exhaust the slots ([`crate::layout::SPARE`]). If they do, somebody
-//! lies, and the writer takes the oldest retired slot all the same. For that case each slot's header has its
-//! position, which is voided before the slot is written again and looked at after it was read.
+//! lies, and the writer takes the oldest retired slot all the same. A pinned read finds that out by the header too.
 //!
 //! Generic over [`Words`], so that the same code runs over mapped memory, the heap, and loom.
 
@@ -51,9 +54,14 @@ pub trait Words {
     fn fetch_and(&self, at: usize, value: u64, order: Ordering) -> u64;
     /// Sets bits of the word at `at` and returns what it was.
     fn fetch_or(&self, at: usize, value: u64, order: Ordering) -> u64;
+    /// Loads neighbouring words from `first` on, relaxed.
+    fn load_run<const N: usize>(&self, first: usize) -> [u64; N] {
+        std::array::from_fn(|at| self.load(first + at, Ordering::Relaxed))
+    }
 }
 
 impl<W: Words> Words for Arc<W> {
+    #[inline]
     fn load(&self, at: usize, order: Ordering) -> u64 {
         (**self).load(at, order)
     }
@@ -68,6 +76,10 @@ impl<W: Words> Words for Arc<W> {
     }
     fn fetch_or(&self, at: usize, value: u64, order: Ordering) -> u64 {
         (**self).fetch_or(at, value, order)
+    }
+    #[inline]
+    fn load_run<const N: usize>(&self, first: usize) -> [u64; N] {
+        (**self).load_run(first)
     }
 }
 
@@ -268,16 +280,19 @@ impl<W: Words> RingWriter<W> {
     }
 
     /// Sizes and places.
+    #[inline]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
 
     /// The memory of samples.
+    #[inline]
     pub fn data(&self) -> &W {
         &self.data
     }
 
     /// The memory of pins.
+    #[inline]
     pub fn ctl(&self) -> &W {
         &self.ctl
     }
@@ -302,6 +317,7 @@ impl<W: Words> RingReader<W> {
     }
 
     /// Newest position, 0 before the first.
+    #[inline]
     pub fn head(&self) -> u64 {
         head(&self.data)
     }
@@ -365,28 +381,52 @@ impl<W: Words> RingReader<W> {
     }
 
     /// Sizes and places.
+    #[inline]
     pub fn shape(&self) -> &Shape {
         &self.shape
     }
 
     /// The memory of samples.
+    #[inline]
     pub fn data(&self) -> &W {
         &self.data
     }
 
     /// The memory of pins.
+    #[inline]
     pub fn ctl(&self) -> &W {
         &self.ctl
     }
 }
 
 /// Newest position, 0 before the first.
+#[inline]
 pub fn head<W: Words>(data: &W) -> u64 {
     // Acquire: pairs with the Release in `RingWriter::publish`.
     data.load(layout::HEAD, order(Site::HeadLoad))
 }
 
+/// Reads the sample at `pos` without a pin: `read` copies what it wants of the slot, by relaxed loads, and its outcome is
+/// given only if all of that was of the sample. [`Miss::Overwritten`] is final: the sample has left the ring.
+#[inline]
+pub fn glance<W: Words, T>(
+    data: &W,
+    shape: &Shape,
+    pos: u64,
+    read: impl FnOnce(u16) -> T,
+) -> Result<T, Miss> {
+    let slot = peek(data, shape, pos)?;
+    let read = read(slot);
+    // A slot is voided only after a newer sample has taken its place in the ring.
+    if slot_is_intact(data, shape, slot, pos) {
+        Ok(read)
+    } else {
+        Err(Miss::Overwritten)
+    }
+}
+
 /// Finds the slot of `pos` for a reader without a pin, who has to ask afterwards whether it was intact.
+#[inline]
 pub fn peek<W: Words>(data: &W, shape: &Shape, pos: u64) -> Result<u16, Miss> {
     let (slot, _) = locate(data, shape, pos)?;
     // Acquire: pairs with the Release of the ring's entry in `RingWriter::publish`.
@@ -402,6 +442,7 @@ pub fn waiting_now<W: Words>(ctl: &W) -> u64 {
 }
 
 /// Finds the slot of `pos`, and the ring's entry that names it. Callers fence before they look into the slot.
+#[inline]
 fn locate<W: Words>(data: &W, shape: &Shape, pos: u64) -> Result<(u16, u64), Miss> {
     let at = shape.ring_word(shape.ring_index(pos));
     let entry = data.load(at, Ordering::Relaxed);
@@ -419,12 +460,13 @@ fn locate<W: Words>(data: &W, shape: &Shape, pos: u64) -> Result<(u16, u64), Mis
 }
 
 /// The words beside a slot's position.
+#[inline]
 pub fn load_stamp<W: Words>(data: &W, shape: &Shape, slot: u16) -> [u64; STAMP_WORDS] {
-    let first = shape.slot_word(slot) + 1;
-    std::array::from_fn(|at| data.load(first + at, Ordering::Relaxed))
+    data.load_run(shape.slot_word(slot) + 1)
 }
 
 /// Whether everything read from the slot so far was of the sample at `pos`.
+#[inline]
 pub fn slot_is_intact<W: Words>(data: &W, shape: &Shape, slot: u16, pos: u64) -> bool {
     // Acquire: pairs with the release fence in `RingWriter::loan`.
     fence(Site::IntactFence);

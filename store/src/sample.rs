@@ -86,6 +86,7 @@ pub struct After<T> {
 }
 
 impl Meta {
+    #[inline]
     pub(crate) fn new(stamp: &Stamp, segment: Epoch, orphaned: bool) -> Self {
         let origin = stamp.origin;
         Self {
@@ -116,6 +117,7 @@ impl Meta {
     }
 
     /// The cursor just behind this sample.
+    #[inline]
     pub fn cursor(&self) -> Cursor {
         Cursor {
             epoch: self.epoch,
@@ -142,6 +144,7 @@ impl fmt::Display for Age {
 
 impl Cursor {
     /// Whether a sample of this origin is newer than all that the cursor stands for.
+    #[inline]
     pub(crate) fn is_before(&self, epoch: Epoch, seq: Seq) -> bool {
         (epoch, seq) > (self.epoch, self.seq)
     }

@@ -22,7 +22,7 @@ use ddx_wire::{Epoch, Seq, Time};
 use thiserror::Error;
 
 pub use self::control::SegmentControl;
-pub use self::reader::{Pin, PinError, SegmentReader};
+pub use self::reader::{Copier, Pin, PinError, SegmentReader};
 pub use self::writer::{LoanError, SegmentWriter, Slot};
 pub use crate::layout::{LayoutError, Spec};
 pub use crate::notify::Bell;
@@ -145,6 +145,7 @@ impl Origin {
 }
 
 impl Stamp {
+    #[inline]
     fn from_words(pos: u64, len: usize, words: &[u64; STAMP_WORDS]) -> Self {
         let [_, epoch, seq, filtered, capture, publish, receive, bound] = *words;
         let origin = Origin {
@@ -169,6 +170,7 @@ impl State {
     const ORPHANED: u64 = 2;
     const REMOVED: u64 = 4;
 
+    #[inline]
     fn from_word(word: u64) -> Self {
         Self {
             superseded: word & Self::SUPERSEDED != 0,

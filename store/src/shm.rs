@@ -132,6 +132,36 @@ impl Map {
         unsafe { out.set_len(len) };
     }
 
+    /// Copies `len` bytes at `offset` out like [`Map::copy_out`], while their writer may be changing them: word by word, by
+    /// relaxed loads. `offset` is a multiple of a word, and the last word may reach beyond the bytes asked for.
+    #[inline]
+    pub fn copy_words_out(&self, offset: usize, len: usize, out: &mut Vec<u8>) {
+        let words = len.div_ceil(WORD);
+        let whole = words.saturating_mul(WORD);
+        out.clear();
+        out.reserve(whole);
+        let from = self.bytes(offset, whole).cast::<AtomicU64>();
+        assert!(from.is_aligned(), "payloads begin at a line");
+        let to = out.as_mut_ptr().cast::<[u8; WORD]>();
+        for at in 0..words {
+            // SAFETY: word `at` ends at most `whole` bytes behind `from`, which `bytes` has found to be in the range.
+            let from = unsafe { from.add(at) };
+            // SAFETY: as in `word`: an aligned word of the range, touched here as an atomic.
+            let word = unsafe { from.as_ref() }.load(Ordering::Relaxed);
+            // SAFETY: word `at` ends at most `whole` bytes behind `to`, which has room for as many (reserved above).
+            let to = unsafe { to.add(at) };
+            // SAFETY: `to` is valid for writing so many bytes, which need no alignment.
+            unsafe { to.write(word.to_le_bytes()) };
+        }
+        // SAFETY: `len` is at most `whole`, and so many bytes of `out` were written above, within its capacity.
+        unsafe { out.set_len(len) };
+    }
+
+    /// Whether other mappings of the same memory may exist. If not, the slices of its writer forbid reading beside them.
+    pub fn is_shared(&self) -> bool {
+        self.backing != Backing::Heap
+    }
+
     /// Sleeps while the low half of the word at `at` equals `seen`, at most `timeout`. May return early.
     pub fn sleep(&self, at: usize, seen: u32, timeout: Duration) {
         memfd::futex_wait(self.low_half(at), seen, timeout);
@@ -168,6 +198,18 @@ impl Words for Map {
     #[inline]
     fn fetch_or(&self, at: usize, value: u64, order: Ordering) -> u64 {
         self.word(at).fetch_or(value, order)
+    }
+    #[inline]
+    fn load_run<const N: usize>(&self, first: usize) -> [u64; N] {
+        let offset = first.saturating_mul(WORD);
+        let len = N.saturating_mul(WORD);
+        let run = self.bytes(offset, len).cast::<AtomicU64>();
+        std::array::from_fn(|at| {
+            // SAFETY: `at` is below `N`, and `bytes` has found so many words to be in the range.
+            let word = unsafe { run.add(at) };
+            // SAFETY: as in `word`: `offset` is a multiple of a word, so this is an aligned word of the range.
+            unsafe { word.as_ref() }.load(Ordering::Relaxed)
+        })
     }
 }
 

@@ -10,8 +10,8 @@ use std::time::Duration;
 use ddx_store::layout::{BASE_PINS, MAX_PINS};
 use ddx_store::notify::Bells;
 use ddx_store::segment::{
-    Bell, HeapSegment, LoanError, Origin, Pin, PinError, Seat, SegmentControl, SegmentError,
-    SegmentFds, SegmentReader, SegmentWriter, Spec, State,
+    Bell, Copier, HeapSegment, LoanError, Origin, Pin, PinError, Seat, SegmentControl,
+    SegmentError, SegmentFds, SegmentReader, SegmentWriter, Spec, State,
 };
 use ddx_wire::{Epoch, Seq, Time};
 
@@ -190,6 +190,50 @@ fn a_reader_that_holds_its_quota_is_refused_and_the_writer_is_not() {
         pins.clear();
         assert!(readers[0].pin_newest().is_ok());
     });
+}
+
+#[test]
+fn copies_of_every_length_are_whole() {
+    let spec = Spec {
+        capacity_bytes: 1200,
+        ..SPEC
+    };
+    both(spec, |mut writer, shared| {
+        let reader = shared.reader(0);
+        let mut payload = vec![0xff; 7];
+        let step = if cfg!(miri) { 149 } else { 1 };
+        for len in (0..=1200).step_by(step) {
+            let pos = publish(&mut writer, len);
+            assert_eq!(reader.copy_newest(&mut payload).unwrap().pos, pos);
+            assert_eq!(payload.len(), len);
+            assert_is_sample(pos, &payload);
+        }
+    });
+}
+
+#[test]
+fn a_small_copy_needs_no_pin() {
+    let (mut writer, fds) = SegmentWriter::create(SPEC, Epoch(3)).unwrap();
+    let reader = SegmentReader::map(&fds, seat(0)).unwrap();
+    publish(&mut writer, 4096);
+    publish(&mut writer, 64);
+    let _held: Vec<_> = (0..BASE_PINS).map(|_| reader.pin(1).unwrap()).collect();
+    let mut payload = Vec::new();
+
+    assert_eq!(reader.copy(2, &mut payload).unwrap().pos, 2);
+    assert_is_sample(2, &payload);
+    assert_eq!(reader.copy(1, &mut payload), Err(PinError::NoPin));
+    // Neither is it refused when it would rather have one, after misses.
+    for _ in 0..4 {
+        publish(&mut writer, 32);
+    }
+    let mut copier = Copier::new(&mut payload);
+    for _ in 0..10 {
+        assert_eq!(copier.copy(&reader, 1), Err(PinError::Overwritten));
+    }
+    copier.copy(&reader, 6).unwrap();
+    assert_eq!(copier.stamp().pos, 6);
+    assert_is_sample(6, copier.payload());
 }
 
 #[test]

@@ -13,7 +13,9 @@ use std::sync::Arc;
 
 use ddx_store::layout::{HEAD, STATE, Shape, Spec};
 use ddx_store::notify::{self, Bell, RUNG};
-use ddx_store::ring::{Miss, RingReader, RingWriter, STAMP_WORDS, Words, peek, waiting_now};
+use ddx_store::ring::{
+    Miss, RingReader, RingWriter, STAMP_WORDS, Words, glance, head, peek, waiting_now,
+};
 use ddx_store::sync::{Ordering, Site, weaken};
 use loom::cell::UnsafeCell;
 use loom::sync::Mutex;
@@ -159,9 +161,17 @@ fn stamp(value: u64) -> [u64; STAMP_WORDS] {
 }
 
 fn check(weakened: Option<Site>, model: impl Fn() + Sync + Send + 'static) {
+    check_with(PREEMPTIONS, weakened, model);
+}
+
+fn check_with(
+    preemptions: usize,
+    weakened: Option<Site>,
+    model: impl Fn() + Sync + Send + 'static,
+) {
     weaken(weakened);
     let mut builder = loom::model::Builder::new();
-    builder.preemption_bound = Some(PREEMPTIONS);
+    builder.preemption_bound = Some(preemptions);
     builder.max_branches = 20_000;
     builder.check(model);
 }
@@ -313,6 +323,55 @@ fn a_forced_slot_is_detected(weakened: Option<Site>) {
     });
 }
 
+/// Readers copy the newest sample without a pin, word by word, while the writer comes round to its slot; or that at `asked`,
+/// which they have not seen at the head.
+fn a_glance_is_of_one_sample(weakened: Option<Site>, readers: u32, asked: Option<u64>) {
+    // Relaxed loads may see many values each: with two readers the third switch takes a minute.
+    let preemptions = if readers > 1 { 2 } else { PREEMPTIONS };
+    check_with(preemptions, weakened, move || {
+        let (item, mut writer) = Item::new(1, || [AtomicU64::new(0), AtomicU64::new(0)]);
+        let publish = |writer: &mut RingWriter<Arc<Memory>>| {
+            let slot = writer.loan().unwrap();
+            let value = writer.published() + 1;
+            for word in item.payload(slot) {
+                word.store(value, Ordering::Relaxed);
+            }
+            writer.publish(slot, &stamp(value));
+        };
+        publish(&mut writer);
+        let threads: Vec<_> = (0..readers)
+            .map(|_| {
+                let item = item.clone();
+                thread::spawn(move || {
+                    let pos = asked.unwrap_or_else(|| head(&item.data));
+                    let copied = glance(&item.data, &item.shape, pos, |slot| {
+                        let seq = item
+                            .data
+                            .load(item.shape.slot_word(slot) + 2, Ordering::Relaxed);
+                        let [first, second] = item.payload(slot);
+                        [
+                            second.load(Ordering::Relaxed),
+                            first.load(Ordering::Relaxed),
+                            seq,
+                        ]
+                    });
+                    match copied {
+                        Ok(copied) => assert_eq!(copied, [pos; 3], "a torn sample passed as whole"),
+                        Err(Miss::Overwritten) => {}
+                        Err(Miss::NotYet) if asked.is_some() => {}
+                        Err(miss) => panic!("the head is ahead of the ring: {miss:?}"),
+                    }
+                })
+            })
+            .collect();
+        publish(&mut writer);
+        publish(&mut writer);
+        for thread in threads {
+            thread.join().unwrap();
+        }
+    });
+}
+
 /// A futex as the kernel has it: the comparison and the sleep are one step before any wake.
 struct Futex {
     asleep: Mutex<bool>,
@@ -445,6 +504,12 @@ fn forced_slot() {
 }
 
 #[test]
+fn two_readers_glance() {
+    a_glance_is_of_one_sample(None, 2, None);
+    a_glance_is_of_one_sample(None, 1, Some(2));
+}
+
+#[test]
 fn waking_for_samples() {
     no_sample_is_slept_through(None);
 }
@@ -523,6 +588,42 @@ fn weak_void_fence() {
 #[should_panic(expected = "a torn sample passed as intact")]
 fn weak_intact_fence() {
     a_forced_slot_is_detected(Some(Site::IntactFence));
+}
+
+#[test]
+#[should_panic(expected = "a torn sample passed as whole")]
+fn weak_void_fence_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::VoidFence), 1, None);
+}
+
+#[test]
+#[should_panic(expected = "a torn sample passed as whole")]
+fn weak_intact_fence_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::IntactFence), 1, None);
+}
+
+#[test]
+#[should_panic(expected = "a torn sample passed as whole")]
+fn weak_ring_store_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::RingStore), 1, Some(2));
+}
+
+#[test]
+#[should_panic(expected = "a torn sample passed as whole")]
+fn weak_peek_fence_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::PeekFence), 1, Some(2));
+}
+
+#[test]
+#[should_panic(expected = "the head is ahead of the ring")]
+fn weak_head_store_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::HeadStore), 1, None);
+}
+
+#[test]
+#[should_panic(expected = "the head is ahead of the ring")]
+fn weak_head_load_for_glances() {
+    a_glance_is_of_one_sample(Some(Site::HeadLoad), 1, None);
 }
 
 #[test]

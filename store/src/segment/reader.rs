@@ -10,7 +10,7 @@ use thiserror::Error;
 use super::control::map_both;
 use super::{Bell, HeapSegment, Seat, SegmentError, SegmentFds, Stamp, State};
 use crate::layout::{self, MAX_PINS, Spec};
-use crate::ring::{Miss, RingReader, Words};
+use crate::ring::{Miss, RingReader, STAMP_WORDS, Words, glance, load_stamp};
 use crate::shm::{Map, fork};
 use crate::sync::Ordering;
 
@@ -40,6 +40,18 @@ pub struct Pin {
     pin: u32,
     slot: u16,
     stamp: Stamp,
+}
+
+/// Copies samples for one call of a reader: small ones without a pin, as long as not several of these copies were overtaken
+/// by the writer, which a pin then prevents; large ones always with a pin.
+#[derive(Debug)]
+pub struct Copier<'a> {
+    payload: &'a mut Vec<u8>,
+    pos: u64,
+    len: usize,
+    words: [u64; STAMP_WORDS],
+    /// Copies without a pin that are still to be tried.
+    glances: u32,
 }
 
 /// Why a position cannot be read.
@@ -96,6 +108,7 @@ impl SegmentReader {
     }
 
     /// Position of the newest sample; 0 before the first, and in a forked process.
+    #[inline]
     pub fn head_pos(&self) -> u64 {
         if self.seated.is_forked() {
             return 0;
@@ -114,6 +127,7 @@ impl SegmentReader {
     }
 
     /// Epoch of the segment.
+    #[inline]
     pub fn epoch(&self) -> Epoch {
         Epoch(self.seated.ring.shape().epoch())
     }
@@ -127,11 +141,11 @@ impl SegmentReader {
     pub fn pin(&self, pos: u64) -> Result<Pin, PinError> {
         let pin = self.seated.take()?;
         match self.seated.hold(pin, pos) {
-            Ok((slot, stamp)) => Ok(Pin {
+            Ok((slot, len, words)) => Ok(Pin {
                 seated: Arc::clone(&self.seated),
                 pin,
                 slot,
-                stamp,
+                stamp: Stamp::from_words(pos, len, &words),
             }),
             Err(error) => {
                 self.seated.release(pin);
@@ -148,22 +162,16 @@ impl SegmentReader {
     /// Copies the sample at `pos`, replacing the content of `payload`, which allocates only to grow. On an error
     /// the content is unspecified.
     pub fn copy(&self, pos: u64, payload: &mut Vec<u8>) -> Result<Stamp, PinError> {
-        let pin = self.seated.take()?;
-        let copied = self.seated.hold(pin, pos).and_then(|(slot, stamp)| {
-            self.seated.copy_out(slot, stamp.len, payload);
-            if self.seated.ring.intact(slot, pos) {
-                Ok(stamp)
-            } else {
-                Err(PinError::Overwritten)
-            }
-        });
-        self.seated.release(pin);
-        copied
+        let mut copier = Copier::new(payload);
+        copier.copy(self, pos)?;
+        Ok(copier.stamp())
     }
 
     /// Copies the newest sample; [`PinError::NotYet`] before the first. Tries again while the writer overtakes it.
     pub fn copy_newest(&self, payload: &mut Vec<u8>) -> Result<Stamp, PinError> {
-        self.newest(|pos| self.copy(pos, payload))
+        let mut copier = Copier::new(payload);
+        copier.copy_newest(self)?;
+        Ok(copier.stamp())
     }
 
     fn newest<T>(&self, mut read: impl FnMut(u64) -> Result<T, PinError>) -> Result<T, PinError> {
@@ -193,6 +201,7 @@ impl SegmentReader {
     }
 
     /// What became of the segment.
+    #[inline]
     pub fn state(&self) -> State {
         if self.seated.is_forked() {
             return State::default();
@@ -217,7 +226,118 @@ impl SegmentReader {
     }
 }
 
+impl<'a> Copier<'a> {
+    /// Replaces the content of `payload` by each copy; it allocates only to grow.
+    #[inline]
+    pub fn new(payload: &'a mut Vec<u8>) -> Self {
+        Self {
+            payload,
+            pos: 0,
+            len: 0,
+            words: [0; STAMP_WORDS],
+            glances: GLANCES,
+        }
+    }
+
+    /// Copies the sample at `pos`. On an error the content of the payload is unspecified.
+    #[inline]
+    pub fn copy(&mut self, segment: &SegmentReader, pos: u64) -> Result<(), PinError> {
+        let seated = &segment.seated;
+        if self.glances == 0 {
+            return self.copy_pinned(seated, pos);
+        }
+        match self.glance(seated, pos) {
+            Ok(true) => Ok(()),
+            Ok(false) => self.copy_pinned(seated, pos),
+            Err(error) => {
+                self.glances -= u32::from(error == PinError::Overwritten);
+                Err(error)
+            }
+        }
+    }
+
+    /// Copies the newest sample like [`SegmentReader::copy_newest`].
+    #[inline]
+    pub fn copy_newest(&mut self, segment: &SegmentReader) -> Result<(), PinError> {
+        match self.glance(&segment.seated, segment.head_pos()) {
+            Ok(true) => Ok(()),
+            Ok(false) | Err(_) => self.copy_newest_patiently(segment),
+        }
+    }
+
+    /// What is stored beside the payload of the last copy. Made here rather than by the copy, because it costs as much to
+    /// move as to make.
+    #[inline]
+    pub fn stamp(&self) -> Stamp {
+        Stamp::from_words(self.pos, self.len, &self.words)
+    }
+
+    /// The bytes of the last copy.
+    #[inline]
+    pub fn payload(&self) -> &[u8] {
+        self.payload
+    }
+
+    #[cold]
+    fn copy_newest_patiently(&mut self, segment: &SegmentReader) -> Result<(), PinError> {
+        segment.newest(|pos| self.copy(segment, pos))
+    }
+
+    /// Copies without a pin; false when the sample is too large for that.
+    #[inline(always)]
+    fn glance(&mut self, seated: &Seated, pos: u64) -> Result<bool, PinError> {
+        if seated.is_forked() {
+            return Err(PinError::Forked);
+        }
+        let (data, shape) = (seated.ring.data(), seated.ring.shape());
+        if !data.is_shared() {
+            return Ok(false);
+        }
+        let most = GLANCED_BYTES.min(shape.capacity());
+        self.pos = pos;
+        let copied = glance(data, shape, pos, |slot| {
+            self.words = load_stamp(data, shape, slot);
+            let len = usize::try_from(self.words[0]).unwrap_or(usize::MAX);
+            if len > most {
+                return false;
+            }
+            self.len = len;
+            data.copy_words_out(shape.payload_offset(slot), len, self.payload);
+            true
+        })?;
+        Ok(copied)
+    }
+
+    #[inline(never)]
+    fn copy_pinned(&mut self, seated: &Seated, pos: u64) -> Result<(), PinError> {
+        match seated.take() {
+            Ok(pin) => {
+                let copied = self.copy_with(seated, pin, pos);
+                seated.release(pin);
+                copied
+            }
+            // Guards hold them all: what can do without a pin goes on without.
+            Err(PinError::NoPin) => match self.glance(seated, pos)? {
+                true => Ok(()),
+                false => Err(PinError::NoPin),
+            },
+            Err(error) => Err(error),
+        }
+    }
+
+    fn copy_with(&mut self, seated: &Seated, pin: u32, pos: u64) -> Result<(), PinError> {
+        let (slot, len, words) = seated.hold(pin, pos)?;
+        seated.copy_out(slot, len, self.payload);
+        if !seated.ring.intact(slot, pos) {
+            return Err(PinError::Overwritten);
+        }
+        (self.pos, self.len, self.words) = (pos, len, words);
+        Ok(())
+    }
+}
+
 impl Seated {
+    #[inline]
     fn is_forked(&self) -> bool {
         fork::is_past(self.generation)
     }
@@ -254,13 +374,9 @@ impl Seated {
         self.taken.fetch_and(!(1 << pin), Release);
     }
 
-    /// Pins `pos` and copies its stamp out, judged.
-    fn hold(&self, pin: u32, pos: u64) -> Result<(u16, Stamp), PinError> {
-        let slot = self.ring.pin(pin, pos).map_err(|miss| match miss {
-            Miss::Overwritten => PinError::Overwritten,
-            Miss::NotYet => PinError::NotYet,
-            Miss::Corrupt => PinError::Corrupt,
-        })?;
+    /// Pins `pos` and copies out what is stored beside its payload, of which the length is judged.
+    fn hold(&self, pin: u32, pos: u64) -> Result<(u16, usize, [u64; STAMP_WORDS]), PinError> {
+        let slot = self.ring.pin(pin, pos)?;
         let words = self.ring.stamp(slot);
         if !self.ring.intact(slot, pos) {
             return Err(PinError::Overwritten);
@@ -269,7 +385,7 @@ impl Seated {
             .ok()
             .filter(|len| *len <= self.ring.shape().capacity())
             .ok_or(PinError::Corrupt)?;
-        Ok((slot, Stamp::from_words(pos, len, &words)))
+        Ok((slot, len, words))
     }
 
     fn payload(&self, slot: u16, len: usize) -> NonNull<u8> {
@@ -280,6 +396,16 @@ impl Seated {
     fn copy_out(&self, slot: u16, len: usize, payload: &mut Vec<u8>) {
         let offset = self.ring.shape().payload_offset(slot);
         self.ring.data().copy_out(offset, len, payload);
+    }
+}
+
+impl From<Miss> for PinError {
+    fn from(miss: Miss) -> Self {
+        match miss {
+            Miss::Overwritten => Self::Overwritten,
+            Miss::NotYet => Self::NotYet,
+            Miss::Corrupt => Self::Corrupt,
+        }
     }
 }
 
@@ -341,3 +467,11 @@ impl Drop for Pin {
         self.seated.release(self.pin);
     }
 }
+
+/// Copies without a pin that one call tries. Each takes a fraction of the time in which a writer comes round to the same slot
+/// at full speed, so a second one already means that the reader was interrupted in the first.
+const GLANCES: u32 = 4;
+
+/// Largest payload that is copied without a pin, bytes. Words one by one are slower than a block: from here on they would cost
+/// more than the pin does.
+const GLANCED_BYTES: usize = 1024;
