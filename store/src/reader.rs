@@ -19,7 +19,7 @@ use crate::sample::{After, Cursor, Meta, Missed, Sample};
 use crate::schema::Schema;
 use crate::segment::{Copier, Pin, PinError, Seat, SegmentFds, SegmentReader, Stamp};
 use crate::store::unexpected;
-use crate::wait::{Condition, Readiness, Wait, wait};
+use crate::wait::{Condition, Patience, Readiness, Wait, sleep};
 use crate::writer::segment_error;
 
 /// Where a reader begins.
@@ -367,16 +367,18 @@ impl RawReader {
         mut read: impl FnMut(&SegmentReader, u64) -> Result<R, PinError>,
         stamp: impl Fn(&R) -> Stamp,
     ) -> Result<Option<(R, Meta)>, Error> {
-        // A call that does not block needs no clock, which would cost as much as the rest of it.
-        let start = (!timeout.is_zero()).then(std::time::Instant::now);
+        let mut patience = Patience::new(timeout);
         for attempt in 0_u32.. {
-            let connection = Arc::clone(&self.seat.connection);
-            let left = start.map_or(Duration::ZERO, |start| {
-                timeout.saturating_sub(start.elapsed())
-            });
-            // A segment whose words contradict one another may look ready for ever.
-            if attempt > ATTEMPTS && left.is_zero() || !wait(&connection, &mut Unseen(self), left)?
-            {
+            if self.readiness()? != Readiness::Ready {
+                if timeout.is_zero() {
+                    break;
+                }
+                let connection = self.connection();
+                if !sleep(&connection, &mut Unseen(self), &mut patience)? {
+                    break;
+                }
+            } else if attempt > ATTEMPTS && patience.left().is_zero() {
+                // A segment whose words contradict one another may look ready for ever.
                 break;
             }
             let from = self.first_unread();
@@ -456,26 +458,26 @@ impl RawReader {
 
     /// Learns of a new segment. Looks at the daemon's socket only when the present one says that there is news, or when
     /// there is none.
+    #[inline(always)]
     fn look(&mut self) -> Result<(), Error> {
         let is_current = self.bound.as_ref().is_some_and(|bound| {
-    #[inline(always)]
             let state = bound.segment.state();
             !state.superseded && !state.removed
         });
         if is_current && !self.detached {
             self.seat.connection.follow()?;
-        }
-        if self.mailbox.has_mail() || self.refused.is_some() {
         } else {
             self.seat.connection.drain()?;
+        }
+        if self.mailbox.has_mail() || self.refused.is_some() {
             self.take_mail()?;
         }
         Ok(())
     }
 
+    #[cold]
     fn take_mail(&mut self) -> Result<(), Error> {
         match self.mailbox.take() {
-    #[cold]
             Some(Mail::Bound(binding, fds)) => self.bind(&binding, &fds)?,
             Some(Mail::Removed) => self.bound = None,
             Some(Mail::Detached) => self.detached = self.bound.is_some(),
@@ -674,14 +676,14 @@ fn contract(rate: Option<f64>) -> Result<Contract, Error> {
     }
 }
 
-fn pin_error(error: PinError, segment: &SegmentReader) -> Error {
-    match error {
 #[inline]
 fn meta(stamp: &Stamp, segment: &SegmentReader) -> Meta {
     Meta::new(stamp, segment.epoch(), segment.state().orphaned)
 }
 
 #[cold]
+fn pin_error(error: PinError, segment: &SegmentReader) -> Error {
+    match error {
         PinError::NoPin => Error::NoPin(segment.pins()),
         PinError::Forked => Error::Forked,
         PinError::Corrupt | PinError::Overwritten | PinError::NotYet => {

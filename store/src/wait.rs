@@ -42,7 +42,9 @@ pub fn wait_any(readers: &mut [&mut dyn Wait], deadline: Duration) -> Result<Opt
         readers,
         found: None,
     };
-    wait(&connection, &mut set, deadline)?;
+    if set.readiness()? != Readiness::Ready && !deadline.is_zero() {
+        sleep(&connection, &mut set, &mut Patience::new(deadline))?;
+    }
     Ok(set.found)
 }
 
@@ -52,23 +54,42 @@ pub(crate) trait Condition {
     fn set_waiting(&mut self, waiting: bool);
 }
 
-/// Blocks until the condition is ready, at most `timeout`; false when the time has passed. Between two slices of at most
-/// 100 ms it looks at the daemon's socket.
-pub(crate) fn wait(
+/// How long a call may still block. The clock is first read when that is first asked, so that a call which need not block
+/// reads none, and one that does reads it once before it sleeps.
+#[derive(Debug)]
+pub(crate) struct Patience {
+    timeout: Duration,
+    start: Option<Instant>,
+}
+
+impl Patience {
+    pub(crate) fn new(timeout: Duration) -> Self {
+        Self {
+            timeout,
+            start: None,
+        }
+    }
+
+    /// What is left of the time since this was first asked.
+    pub(crate) fn left(&mut self) -> Duration {
+        match self.start {
+            Some(start) => self.timeout.saturating_sub(start.elapsed()),
+            None => {
+                self.start = Some(Instant::now());
+                self.timeout
+            }
+        }
+    }
+}
+
+/// Blocks until a condition that was not ready is, as long as there is patience; false when there is none left. Between two
+/// slices of at most 100 ms it looks at the daemon's socket.
+pub(crate) fn sleep(
     connection: &Connection,
     condition: &mut impl Condition,
-    timeout: Duration,
+    patience: &mut Patience,
 ) -> Result<bool, Error> {
-    if condition.readiness()? == Readiness::Ready {
-        return Ok(true);
-    }
-    if timeout.is_zero() {
-        return Ok(false);
-    }
-    let start = Instant::now();
-    let waited = sleep_until_ready(connection, condition, || {
-        timeout.saturating_sub(start.elapsed())
-    });
+    let waited = sleep_until_ready(connection, condition, patience);
     condition.set_waiting(false);
     waited
 }
@@ -76,7 +97,7 @@ pub(crate) fn wait(
 fn sleep_until_ready(
     connection: &Connection,
     condition: &mut impl Condition,
-    left: impl Fn() -> Duration,
+    patience: &mut Patience,
 ) -> Result<bool, Error> {
     loop {
         let (bells, client) = connection.bell();
@@ -90,7 +111,7 @@ fn sleep_until_ready(
                 return ready.map(|_| true);
             }
         };
-        let left = left();
+        let left = patience.left();
         if left.is_zero() {
             bells.disarm(client);
             return Ok(false);
