@@ -4,6 +4,7 @@ use ddx_wire::Time;
 
 /// Reads CLOCK_BOOTTIME, which counts through suspend and never steps. Makes no system call where the kernel offers
 /// the clock to user space, as it does on all common platforms.
+#[inline]
 #[expect(unsafe_code, reason = "std has no boot-time clock")]
 pub fn now() -> Time {
     let mut read = libc::timespec {

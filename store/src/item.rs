@@ -45,6 +45,11 @@ pub trait Item: Sized {
     /// Appends this value's payload to `out`. Fails only where the encoding cannot express the value.
     fn encode(&self, out: &mut Vec<u8>) -> Result<(), SchemaError>;
 
+    /// This value's payload where that is there already, as of a plain type, which is its own: spares a copy.
+    fn as_payload(&self) -> Option<&[u8]> {
+        None
+    }
+
     /// Reads a value that takes up all of `payload`, which may hold anything.
     fn decode(payload: &[u8]) -> Result<Self, SchemaError>;
 }
@@ -174,6 +179,10 @@ macro_rules! plain_scalars {
                 Ok(())
             }
 
+            fn as_payload(&self) -> Option<&[u8]> {
+                Some(plain::bytes(self))
+            }
+
             fn decode(payload: &[u8]) -> Result<Self, SchemaError> {
                 plain::read(payload)
             }
@@ -204,6 +213,10 @@ impl<T: Plain, const N: usize> Item for [T; N] {
     fn encode(&self, out: &mut Vec<u8>) -> Result<(), SchemaError> {
         out.extend_from_slice(plain::bytes(self));
         Ok(())
+    }
+
+    fn as_payload(&self) -> Option<&[u8]> {
+        Some(plain::bytes(self))
     }
 
     fn decode(payload: &[u8]) -> Result<Self, SchemaError> {
@@ -276,6 +289,10 @@ impl Item for Vec<u8> {
     fn encode(&self, out: &mut Vec<u8>) -> Result<(), SchemaError> {
         out.extend_from_slice(self);
         Ok(())
+    }
+
+    fn as_payload(&self) -> Option<&[u8]> {
+        Some(self)
     }
 
     fn decode(payload: &[u8]) -> Result<Self, SchemaError> {

@@ -58,6 +58,12 @@ pub trait Words {
     fn load_run<const N: usize>(&self, first: usize) -> [u64; N] {
         std::array::from_fn(|at| self.load(first + at, Ordering::Relaxed))
     }
+    /// Stores neighbouring words from `first` on, relaxed.
+    fn store_run<const N: usize>(&self, first: usize, values: &[u64; N]) {
+        for (at, value) in values.iter().enumerate() {
+            self.store(first + at, *value, Ordering::Relaxed);
+        }
+    }
 }
 
 impl<W: Words> Words for Arc<W> {
@@ -65,6 +71,7 @@ impl<W: Words> Words for Arc<W> {
     fn load(&self, at: usize, order: Ordering) -> u64 {
         (**self).load(at, order)
     }
+    #[inline]
     fn store(&self, at: usize, value: u64, order: Ordering) {
         (**self).store(at, value, order);
     }
@@ -80,6 +87,10 @@ impl<W: Words> Words for Arc<W> {
     #[inline]
     fn load_run<const N: usize>(&self, first: usize) -> [u64; N] {
         (**self).load_run(first)
+    }
+    #[inline]
+    fn store_run<const N: usize>(&self, first: usize, values: &[u64; N]) {
+        (**self).store_run(first, values);
     }
 }
 
@@ -155,6 +166,7 @@ impl<W: Words> RingWriter<W> {
     }
 
     /// Takes a slot to write, voided. `None` when all slots outside the ring are on loan.
+    #[inline(always)]
     pub fn loan(&mut self) -> Option<u16> {
         let slot = self.take()?;
         self.data
@@ -165,10 +177,16 @@ impl<W: Words> RingWriter<W> {
         Some(slot)
     }
 
+    #[inline]
     fn take(&mut self) -> Option<u16> {
-        if let Some(slot) = self.free.pop() {
-            return Some(slot);
+        match self.free.pop() {
+            Some(slot) => Some(slot),
+            None => self.find(),
         }
+    }
+
+    #[inline(never)]
+    fn find(&mut self) -> Option<u16> {
         let no_fresh = self.fresh == self.shape.slots();
         if no_fresh || self.retired.len() >= self.scan_at {
             self.scan();
@@ -227,13 +245,12 @@ impl<W: Words> RingWriter<W> {
     }
 
     /// Makes a loaned slot the newest sample. The caller rings the bells of the cells that wait.
+    #[inline(always)]
     pub fn publish(&mut self, slot: u16, stamp: &[u64; STAMP_WORDS]) -> Published {
         let pos = self.pos + 1;
         self.pos = pos;
         let header = self.shape.slot_word(slot);
-        for (at, word) in stamp.iter().enumerate() {
-            self.data.store(header + 1 + at, *word, Ordering::Relaxed);
-        }
+        self.data.store_run(header + 1, stamp);
         self.data.store(header, pos, Ordering::Relaxed);
         crash::point("publish.stamped");
 

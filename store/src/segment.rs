@@ -129,6 +129,7 @@ impl SegmentFds {
 }
 
 impl Origin {
+    #[inline]
     fn to_words(self, len: u64) -> [u64; STAMP_WORDS] {
         [
             len,

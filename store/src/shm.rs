@@ -211,6 +211,18 @@ impl Words for Map {
             unsafe { word.as_ref() }.load(Ordering::Relaxed)
         })
     }
+    #[inline]
+    fn store_run<const N: usize>(&self, first: usize, values: &[u64; N]) {
+        let offset = first.saturating_mul(WORD);
+        let len = N.saturating_mul(WORD);
+        let run = self.bytes(offset, len).cast::<AtomicU64>();
+        for (at, value) in values.iter().enumerate() {
+            // SAFETY: `at` is below `N`, and `bytes` has found so many words to be in the range.
+            let word = unsafe { run.add(at) };
+            // SAFETY: as in `word`: `offset` is a multiple of a word, so this is an aligned word of the range.
+            unsafe { word.as_ref() }.store(*value, Ordering::Relaxed);
+        }
+    }
 }
 
 impl Drop for Map {

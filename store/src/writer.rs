@@ -97,20 +97,21 @@ impl<T: Item> Writer<T> {
     /// Publishes `value` as captured now. Never blocks, and makes no system call while no reader waits. Fails when the
     /// value is longer than the item's capacity.
     pub fn write(&mut self, value: &T) -> Result<Seq, Error> {
-        self.fill(value)?.publish()
+        match value.as_payload() {
+            Some(payload) => self.raw.write(payload),
+            None => self.raw.write(encoded(value, &mut self.payload)?),
+        }
     }
 
     /// Publishes `value`, whose content was true at `capture`.
     pub fn write_at(&mut self, value: &T, capture: Time) -> Result<Seq, Error> {
-        self.fill(value)?.publish_at(capture)
-    }
-
-    fn fill(&mut self, value: &T) -> Result<RawLoan<'_>, Error> {
-        self.payload.clear();
-        value.encode(&mut self.payload)?;
-        let mut loan = self.raw.loan(self.payload.len())?;
-        loan.as_mut_slice().copy_from_slice(&self.payload);
-        Ok(loan)
+        let payload = match value.as_payload() {
+            Some(payload) => payload,
+            None => encoded(value, &mut self.payload)?,
+        };
+        let mut loan = self.raw.loan(payload.len())?;
+        loan.as_mut_slice().copy_from_slice(payload);
+        loan.publish_at(capture)
     }
 
     /// The item's name.
@@ -265,13 +266,10 @@ impl RawWriter {
 
     /// Memory for a payload of `len` bytes, with unspecified content. Never blocks. Fails when `len` is more than the
     /// item's capacity, and when a daemon that was started anew has given the item to another writer.
+    #[inline(always)]
     pub fn loan(&mut self, len: usize) -> Result<RawLoan<'_>, Error> {
         self.take_news()?;
-        let slot = self.segment.loan(len).map_err(|error| match error {
-            LoanError::TooLong { len, capacity } => Error::TooLong { len, capacity },
-            LoanError::Forked => Error::Forked,
-            LoanError::NoSlot => Error::Segment(error.to_string()),
-        })?;
+        let slot = self.segment.loan(len).map_err(loan_error)?;
         crash::point("publish.loaned");
         Ok(RawLoan {
             writer: self,
@@ -299,9 +297,18 @@ impl RawWriter {
         self.segment.forced()
     }
 
+    #[inline]
     fn take_news(&mut self) -> Result<(), Error> {
+        self.lease.connection.follow()?;
+        if self.lease.connection.life() != self.life || self.mailbox.has_mail() {
+            self.take_mail()?;
+        }
+        Ok(())
+    }
+
+    #[cold]
+    fn take_mail(&mut self) -> Result<(), Error> {
         let connection = &self.lease.connection;
-        connection.follow()?;
         let life = connection.life();
         if life != self.life {
             self.segment.set_bells(Some(connection.bell().0));
@@ -317,6 +324,7 @@ impl RawWriter {
         }
     }
 
+    #[inline]
     fn next_origin(&mut self, capture: Time, publish: Time) -> Origin {
         self.seq = Seq(self.seq.0 + 1);
         Origin {
@@ -363,6 +371,7 @@ impl RawLoan<'_> {
     }
 
     /// The memory, to be filled.
+    #[inline]
     pub fn as_mut_slice(&mut self) -> &mut [u8] {
         match &mut self.slot {
             Some(slot) => self.writer.segment.slot_bytes_mut(slot),
@@ -371,6 +380,7 @@ impl RawLoan<'_> {
     }
 
     /// Publishes the sample as captured now.
+    #[inline(always)]
     pub fn publish(self) -> Result<Seq, Error> {
         // Read once: the clock is half of what a write of a few bytes costs.
         let now = clock::now();
@@ -382,6 +392,7 @@ impl RawLoan<'_> {
         self.publish_between(capture, clock::now())
     }
 
+    #[inline(always)]
     fn publish_between(self, capture: Time, publish: Time) -> Result<Seq, Error> {
         self.writer.lease.connection.check_fork()?;
         let origin = self.writer.next_origin(capture, publish);
@@ -389,6 +400,7 @@ impl RawLoan<'_> {
     }
 
     /// Publishes a sample that was made elsewhere.
+    #[inline(always)]
     pub fn publish_with(mut self, origin: &Origin) -> Seq {
         crash::point("publish.filled");
         if let Some(slot) = self.slot.take() {
@@ -427,6 +439,21 @@ fn seed(segment: &mut SegmentWriter, last: &crate::segment::SegmentFds) -> Resul
     segment.slot_bytes_mut(&mut slot).copy_from_slice(&payload);
     segment.publish(slot, &stamp.origin);
     Ok(())
+}
+
+fn encoded<'a, T: Item>(value: &T, payload: &'a mut Vec<u8>) -> Result<&'a [u8], Error> {
+    payload.clear();
+    value.encode(payload)?;
+    Ok(payload)
+}
+
+#[cold]
+fn loan_error(error: LoanError) -> Error {
+    match error {
+        LoanError::TooLong { len, capacity } => Error::TooLong { len, capacity },
+        LoanError::Forked => Error::Forked,
+        LoanError::NoSlot => Error::Segment(error.to_string()),
+    }
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "for map_err")]

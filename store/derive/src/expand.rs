@@ -104,6 +104,10 @@ fn plain_struct(ident: &Ident, name: &str, fields: &[(&Ident, &Field)]) -> Resul
                 ::core::result::Result::Ok(())
             }
 
+            fn as_payload(&self) -> ::core::option::Option<&[u8]> {
+                ::core::option::Option::Some(::ddx_store::item::plain::bytes(self))
+            }
+
             fn decode(
                 payload: &[u8],
             ) -> ::core::result::Result<Self, ::ddx_store::schema::SchemaError> {

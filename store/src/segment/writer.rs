@@ -96,6 +96,7 @@ impl SegmentWriter {
 
     /// Takes memory for a payload of `len` bytes, with unspecified content. Never blocks: when readers hold more than
     /// they were granted, the oldest sample among those is overwritten, which its holder can tell, and counted.
+    #[inline(always)]
     pub fn loan(&mut self, len: usize) -> Result<Slot, LoanError> {
         if fork::is_past(self.generation) {
             return Err(LoanError::Forked);
@@ -120,6 +121,7 @@ impl SegmentWriter {
     }
 
     /// The payload of a slot, to be filled in place.
+    #[inline]
     #[expect(unsafe_code, reason = "the payload of a loan is written in place")]
     pub fn slot_bytes_mut<'a>(&'a mut self, slot: &'a mut Slot) -> &'a mut [u8] {
         if fork::is_past(self.generation) {
@@ -137,6 +139,7 @@ impl SegmentWriter {
 
     /// Makes the slot the item's newest sample and wakes those who wait for it. Returns its position. Enters the
     /// kernel only to wake a sleeping reader.
+    #[inline(always)]
     pub fn publish(&mut self, slot: Slot, origin: &Origin) -> u64 {
         if fork::is_past(self.generation) {
             return self.ring.published();
@@ -181,6 +184,7 @@ impl SegmentWriter {
     }
 
     /// Epoch of the segment.
+    #[inline]
     pub fn epoch(&self) -> Epoch {
         Epoch(self.ring.shape().epoch())
     }
@@ -188,10 +192,12 @@ impl SegmentWriter {
 
 impl Slot {
     /// Bytes of the payload.
+    #[inline]
     pub fn size(&self) -> usize {
         usize::try_from(self.len).unwrap_or(usize::MAX)
     }
 
+    #[inline]
     fn into_index(self) -> u16 {
         self.index
     }
