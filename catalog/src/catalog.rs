@@ -21,6 +21,7 @@ use crate::hosts::{HostState, Hosts, Task};
 use crate::interest::{Interest, StreamIn};
 use crate::membership::{Entry, Membership};
 use crate::outbox::{Dest, Outbox};
+use crate::paths::PathStatus;
 use crate::prefix::{self, Holder};
 use crate::rng::Rng;
 use crate::session::Sessions;
@@ -97,6 +98,8 @@ pub struct Transmit {
 pub enum TimerName {
     /// Beacons, greetings of seeds, challenges.
     Session,
+    /// Probes of the paths to hosts with several addresses.
+    Paths,
     /// The membership protocol.
     Membership,
     /// A look at all hosts.
@@ -122,8 +125,10 @@ pub struct HostStatus {
     pub incarnation: Incarnation,
     /// Short name of that life.
     pub tag: Tag,
-    /// Its control address.
+    /// Its control address that is in use.
     pub addr: SocketAddr,
+    /// All its addresses, and how they answer; none without a session.
+    pub paths: Vec<PathStatus>,
     /// Whether it has proved itself, so that more than hearsay is known.
     pub session: bool,
     /// How it appears from here.
@@ -132,7 +137,7 @@ pub struct HostStatus {
     pub since: Time,
     /// When it was last heard.
     pub heard: Time,
-    /// Shortest recent round trip.
+    /// Smoothed round trip to the address in use if that is probed, else the shortest recent one.
     pub rtt: Option<Duration>,
     /// Its boot clock minus this host's.
     pub clock: Option<ClockOffset>,
@@ -212,6 +217,11 @@ impl Catalog {
                     self.sessions
                         .handle_timeout(now, &mut self.rng, &mut self.out);
                 }
+                TimerName::Paths => {
+                    let (interest, streams) = (&self.interest, &self.streams);
+                    let busy = |tag| interest.reads(tag) || streams.serves(tag);
+                    self.sessions.paths.handle_timeout(now, busy, &mut self.out);
+                }
                 TimerName::Membership => self.membership.handle_timeout(now),
                 TimerName::Hosts => self.watch(now),
                 TimerName::Directory => {
@@ -229,6 +239,18 @@ impl Catalog {
             }
             self.settle(now);
         }
+    }
+
+    /// Has these control addresses from now on, the best first; perhaps none for a while. All hosts are told at once.
+    pub fn set_control_addrs(&mut self, addrs: &[SocketAddr], now: Time) {
+        self.now = now;
+        if self.left {
+            return;
+        }
+        self.sessions.set_control_addrs(addrs, now);
+        // What was measured says nothing of the ways from here that are left.
+        self.sessions.paths.refresh(now, &mut self.out);
+        self.settle(now);
     }
 
     /// Adds an item of this host to the directory, or changes its description.
@@ -339,6 +361,7 @@ impl Catalog {
         }
         [
             (self.sessions.poll_timeout(), TimerName::Session),
+            (self.sessions.paths.poll_timeout(), TimerName::Paths),
             (self.membership.poll_timeout(), TimerName::Membership),
             (self.hosts.poll_timeout(), TimerName::Hosts),
             (self.directory.poll_timeout(), TimerName::Directory),
@@ -362,6 +385,9 @@ impl Catalog {
             .iter()
             .map(|(id, host)| {
                 let clock = self.clocks.get(&host.tag);
+                let paths = self.sessions.paths.status(host.tag);
+                let used = paths.iter().find(|path| path.used);
+                let rtt = clock.and_then(Clock::rtt_ns).map(Duration::from_nanos);
                 HostStatus {
                     host: id,
                     name: host.name.clone(),
@@ -371,15 +397,13 @@ impl Catalog {
                         .unwrap_or_else(|| host.name.to_string()),
                     incarnation: host.entry.incarnation,
                     tag: host.tag,
-                    addr: self
-                        .sessions
-                        .get(host.tag)
-                        .map_or(host.addr, |session| session.addr),
+                    addr: used.map_or(host.addr, |path| path.addr),
                     session: self.sessions.get(host.tag).is_some(),
                     state: host.state,
                     since: host.since,
                     heard: host.heard,
-                    rtt: clock.and_then(Clock::rtt_ns).map(Duration::from_nanos),
+                    rtt: used.and_then(|path| path.rtt).or(rtt),
+                    paths,
                     clock: clock.and_then(|clock| clock.estimate(self.now)),
                 }
             })
@@ -441,6 +465,13 @@ impl Catalog {
                 self.waiting.push_back((tag, bytes));
             }
         }
+        while let Some(tag) = self.sessions.paths.poll_moved() {
+            if let Some(at) = handle::reader_addr(&self.sessions, tag) {
+                self.streams.moved(tag, at, now, &mut self.out);
+            }
+            // So that the owner learns what is held, and sends by the new path what was missed.
+            self.interest.renew_now(tag, now);
+        }
         while let Some(name) = self.directory.poll_changed() {
             let owner = self.owner(&name);
             self.interest.resolve(&name, owner, now, &mut self.out);
@@ -463,16 +494,13 @@ impl Catalog {
                     let Some(host) = self.hosts.get(host) else {
                         continue;
                     };
-                    if let Some(session) = self.sessions.get(host.tag) {
+                    if let Some(addr) = self.sessions.paths.addr(host.tag) {
                         self.out.send(host.tag, &Message::Ping { version });
+                        self.sessions.paths.ask(host.tag, now, &mut self.out);
                         if host.state != HostState::Up {
                             // Another life of it may be there by now.
-                            self.sessions.hello(
-                                Dest::Addr(session.addr),
-                                false,
-                                now,
-                                &mut self.out,
-                            );
+                            self.sessions
+                                .hello(Dest::Addr(addr), false, now, &mut self.out);
                         }
                     } else {
                         let (tag, addr) = (host.tag, host.addr);

@@ -8,11 +8,12 @@
 //!
 //! ```text
 //! session     greetings, challenges, keys         the door: nothing below sees a stranger
+//! paths       addresses, probes                   which address of a host to use
 //! membership  SWIM, by the foca crate             rumours about hosts
 //! hosts       up, unreachable, down, left         what is believed of them
 //! directory   items, digests, deltas, schemas     who has what
 //! interest    subscriptions, renewals             what this host wants
-//! streams     leases, paths                       what others want of it
+//! streams     leases, groups                      what others want of it
 //! clock       offset and bound of each host       how old a remote sample is
 //! ```
 //!
@@ -31,6 +32,7 @@ mod hosts;
 mod interest;
 mod membership;
 mod outbox;
+mod paths;
 mod prefix;
 mod rng;
 mod session;
@@ -47,4 +49,5 @@ pub use event::Event;
 pub use hosts::HostState;
 pub use interest::StreamIn;
 pub use outbox::Dest;
+pub use paths::PathStatus;
 pub use streams::StreamOut;

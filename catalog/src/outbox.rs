@@ -26,6 +26,8 @@ pub enum Dest {
 pub(crate) enum Target {
     Greeting(Dest),
     Session(Tag),
+    /// A session, by one of its paths.
+    Path(Tag, SocketAddr),
 }
 
 #[derive(Debug)]
@@ -48,6 +50,13 @@ impl Outbox {
         let mut bytes = vec![0; HEADER_BYTES];
         let fits = codec::encode(message, &mut bytes).is_ok();
         self.push(Target::Session(to), bytes, fits);
+    }
+
+    /// Sends to one address of a host, which need not be the one in use.
+    pub(crate) fn send_by(&mut self, to: Tag, addr: SocketAddr, message: &Message) {
+        let mut bytes = vec![0; HEADER_BYTES];
+        let fits = codec::encode(message, &mut bytes).is_ok();
+        self.push(Target::Path(to, addr), bytes, fits);
     }
 
     pub(crate) fn greet(&mut self, to: Dest, greeting: &Greeting) {

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::message::{CONTROL_ADDRS_MAX, Greeting, Introduction};
+use ddx_wire::message::{CONTROL_ADDRS_MAX, Greeting, Introduction, Message};
 use ddx_wire::seal::{
     self, DomainKey, Header, Lane, MIXED_STREAMS, Opener, Purpose, Refused, Sealer,
 };
@@ -16,6 +16,7 @@ use ddx_wire::{HostId, Incarnation, Tag, Time, codec};
 
 use crate::config::Config;
 use crate::outbox::{Dest, Outbox, Outgoing, Target};
+use crate::paths::Paths;
 use crate::rng::Rng;
 
 /// Beacons come fast at first, so that a domain meets within a round trip, then slowly, for those who were deaf. At a loss
@@ -29,6 +30,12 @@ const BEACON_START: [Duration; 5] = [
 ];
 const BEACON_PERIOD: Duration = Duration::from_secs(4);
 const SEED_PERIOD: Duration = Duration::from_millis(500);
+/// News of this host's addresses are said again after these pauses, in case they were lost.
+const NEWS_AGAIN: [Duration; 3] = [
+    Duration::from_millis(100),
+    Duration::from_millis(300),
+    Duration::from_secs(1),
+];
 const CHALLENGE_RETRY: Duration = Duration::from_millis(100);
 const CHALLENGE_TRIES: u32 = 10;
 const PENDING_MAX: usize = 256;
@@ -40,8 +47,7 @@ const EAGER_SESSIONS: usize = 32;
 /// One life of another host that proved itself.
 pub(crate) struct Session {
     pub(crate) host: HostId,
-    pub(crate) addr: SocketAddr,
-    pub(crate) data_addr: SocketAddr,
+    pub(crate) data_port: u16,
     pub(crate) multicast: bool,
     opener: Opener,
 }
@@ -77,11 +83,16 @@ pub(crate) struct Sessions {
     control: Sealer,
     pending: BTreeMap<Tag, Pending>,
     live: BTreeMap<Tag, Session>,
+    pub(crate) paths: Paths,
     tag_of: BTreeMap<HostId, Tag>,
     seeds: Vec<SocketAddr>,
     next_seed: Option<Time>,
     next_beacon: Option<Time>,
     beacons: usize,
+    /// How often this host's addresses changed, and when to say so next.
+    revision: u64,
+    next_news: Option<Time>,
+    news: usize,
 }
 
 struct Pending {
@@ -115,11 +126,15 @@ impl Sessions {
             key: config.key.clone(),
             pending: BTreeMap::new(),
             live: BTreeMap::new(),
+            paths: Paths::default(),
             tag_of: BTreeMap::new(),
             seeds: config.seeds.clone(),
             next_seed: (!config.seeds.is_empty()).then_some(now),
             next_beacon: config.beacon.then_some(now),
             beacons: 0,
+            revision: 0,
+            next_news: None,
+            news: 0,
         }
     }
 
@@ -146,6 +161,24 @@ impl Sessions {
         self.me.rejoin = rejoin;
     }
 
+    /// Has this host's addresses from now on, and tells everybody.
+    pub(crate) fn set_control_addrs(&mut self, addrs: &[SocketAddr], now: Time) {
+        self.me.control_addrs = addrs.iter().copied().take(CONTROL_ADDRS_MAX).collect();
+        self.revision += 1;
+        (self.next_news, self.news) = (Some(now), 0);
+        self.beacons = 0;
+        for next in [&mut self.next_beacon, &mut self.next_seed] {
+            *next = next.map(|_| now);
+        }
+    }
+
+    /// Where a host receives unicast samples: at the address in use.
+    pub(crate) fn data_addr(&self, tag: Tag) -> Option<SocketAddr> {
+        let session = self.live.get(&tag)?;
+        let addr = self.paths.addr(tag)?;
+        Some(SocketAddr::new(addr.ip(), session.data_port))
+    }
+
     /// The key material for samples of one life of a host.
     pub(crate) fn data_opener(&self, host: HostId, incarnation: Incarnation) -> Opener {
         Opener::new(&self.key, host, incarnation, Purpose::Data)
@@ -153,6 +186,7 @@ impl Sessions {
 
     /// Ends the session with a life that is over.
     pub(crate) fn close(&mut self, tag: Tag) {
+        self.paths.forget(tag);
         if let Some(session) = self.live.remove(&tag)
             && self.tag_of.get(&session.host) == Some(&tag)
         {
@@ -164,15 +198,10 @@ impl Sessions {
     pub(crate) fn open<'a>(
         &mut self,
         sender: Tag,
-        from: SocketAddr,
         datagram: &'a mut [u8],
     ) -> Result<&'a [u8], Refused> {
         let session = self.live.get_mut(&sender).ok_or(Refused::UnknownSender)?;
-        let opened = session.opener.open(datagram)?;
-        // A host that moved, or whose NAT did, is followed to where its authentic and fresh datagrams come from.
-        session.addr = from;
-        session.data_addr.set_ip(from.ip());
-        Ok(opened.plaintext)
+        Ok(session.opener.open(datagram)?.plaintext)
     }
 
     /// Opens a greeting, whose sender must be who it says.
@@ -263,7 +292,7 @@ impl Sessions {
                 if !known || echo > now {
                     return Greeted::StaleResponse;
                 }
-                let Some(fresh) = self.establish(sender, &from, addr) else {
+                let Some(fresh) = self.establish(sender, &from, addr, now, out) else {
                     return Greeted::OverLimit;
                 };
                 if let Some(nonce) = challenge {
@@ -328,7 +357,7 @@ impl Sessions {
 
     pub(crate) fn poll_timeout(&self) -> Option<Time> {
         let pending = self.pending.values().map(|p| p.next).min();
-        [self.next_seed, self.next_beacon, pending]
+        [self.next_seed, self.next_beacon, self.next_news, pending]
             .into_iter()
             .flatten()
             .min()
@@ -347,11 +376,16 @@ impl Sessions {
         }
         if self.next_seed.is_some_and(|at| at <= now) {
             for seed in &self.seeds {
-                if !self.live.values().any(|session| session.addr == *seed) {
+                if !self.paths.knows(*seed) {
                     self.hello(Dest::Addr(*seed), true, now, out);
                 }
             }
             self.next_seed = Some(now + SEED_PERIOD);
+        }
+        if self.next_news.is_some_and(|at| at <= now) {
+            self.next_news = NEWS_AGAIN.get(self.news).map(|pause| now + *pause);
+            self.news += 1;
+            self.tell_addresses(out);
         }
         self.pending
             .retain(|_, p| p.tries < CHALLENGE_TRIES || p.next > now);
@@ -367,7 +401,11 @@ impl Sessions {
         let (dest, sealer, lane) = match outgoing.target {
             Target::Greeting(dest) => (dest, &mut self.hello, Lane::Hello),
             Target::Session(tag) => {
-                let addr = self.live.get(&tag)?.addr;
+                let addr = self.paths.addr(tag)?;
+                (Dest::Addr(addr), &mut self.control, Lane::Control)
+            }
+            Target::Path(tag, addr) => {
+                self.live.get(&tag)?;
                 (Dest::Addr(addr), &mut self.control, Lane::Control)
             }
         };
@@ -394,7 +432,7 @@ impl Sessions {
         rng: &mut Rng,
         out: &mut Outbox,
     ) -> Greeted {
-        let known = self.live.contains_key(&sender);
+        let known = self.live.contains_key(&sender) && !self.paths.is_strange(sender, addr, now);
         let crowded =
             self.live.len() >= EAGER_SESSIONS && rng.below(self.live.len()) >= EAGER_SESSIONS / 2;
         if !directed && (known || crowded) {
@@ -447,11 +485,17 @@ impl Sessions {
     }
 
     /// Accepts a life that proved itself; says whether it is new, or `None` when there is no room for it.
-    fn establish(&mut self, tag: Tag, from: &Introduction, addr: SocketAddr) -> Option<bool> {
+    fn establish(
+        &mut self,
+        tag: Tag,
+        from: &Introduction,
+        addr: SocketAddr,
+        now: Time,
+        out: &mut Outbox,
+    ) -> Option<bool> {
         self.pending.remove(&tag);
-        if let Some(session) = self.live.get_mut(&tag) {
-            session.addr = addr;
-            session.data_addr.set_ip(addr.ip());
+        if self.live.contains_key(&tag) {
+            self.paths.heard(tag, addr, now, out);
             return Some(false);
         }
         if self.live.len() >= SESSIONS_MAX {
@@ -460,14 +504,30 @@ impl Sessions {
         let opener = Opener::new(&self.key, from.host, from.incarnation, Purpose::Control);
         let session = Session {
             host: from.host,
-            addr,
-            data_addr: SocketAddr::new(addr.ip(), from.data_port),
+            data_port: from.data_port,
             multicast: from.multicast,
             opener,
         };
         self.live.insert(tag, session);
+        self.paths.met(tag, addr, &from.control_addrs, now, out);
         self.tag_of.insert(from.host, tag);
         Some(true)
+    }
+
+    /// Says to each host, by each path, where this one is now. Without an address nobody would hear it.
+    fn tell_addresses(&self, out: &mut Outbox) {
+        if self.me.control_addrs.is_empty() {
+            return;
+        }
+        let news = Message::Addresses {
+            revision: self.revision,
+            control_addrs: self.me.control_addrs.clone(),
+        };
+        for tag in self.live.keys() {
+            for addr in self.paths.addrs(*tag) {
+                out.send_by(*tag, addr, &news);
+            }
+        }
     }
 
     fn introduction(&self, now: Time) -> Introduction {

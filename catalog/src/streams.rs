@@ -20,6 +20,8 @@ const LEASE: Duration = Duration::from_secs(3);
 const TICK: Duration = Duration::from_millis(250);
 /// Pause before a group is tried again after a failed trial.
 const TRIAL_PAUSE: Duration = Duration::from_secs(30);
+/// The same after a reader moved: long enough for its host to join where it is now.
+const MOVED_PAUSE: Duration = Duration::from_secs(1);
 const LEASES_MAX: usize = 65_536;
 const LEASES_PER_HOST_MAX: usize = 16_384;
 /// Entries of one grant: they take at most 34 bytes each, with an IPv6 group.
@@ -251,6 +253,29 @@ impl Streams {
                 epoch: entry.epoch,
                 seq: entry.seq,
             });
+        }
+    }
+
+    /// Sends what a host reads to another address of it from now on.
+    ///
+    /// Its group may not reach it there: what it shares with others goes to all by unicast for a moment, until a new
+    /// trial has shown that the group does.
+    pub(crate) fn moved(&mut self, reader: Tag, at: ReaderAddr, now: Time, out: &mut Outbox) {
+        let leases = self.leases.range_mut((reader, 0)..=(reader, u32::MAX));
+        let mut streams = Vec::new();
+        for (_, lease) in leases.filter(|(_, lease)| lease.at.data != at.data) {
+            lease.at = at;
+            if !lease.closed {
+                streams.push(lease.stream);
+            }
+        }
+        for id in streams {
+            if let Some(stream) = self.streams.get_mut(&id)
+                && stream.readers.len() > 1
+            {
+                stream.unicast_until = stream.unicast_until.max(now + MOVED_PAUSE);
+            }
+            self.route(id, now, out);
         }
     }
 

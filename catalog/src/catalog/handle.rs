@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::message::{Greeting, Introduction, Message};
+use ddx_wire::message::{CONTROL_ADDRS_MAX, Greeting, Introduction, Message};
 use ddx_wire::seal::Refused;
 use ddx_wire::{HostId, ItemName, Tag, Time, codec};
 
@@ -118,18 +118,20 @@ impl Catalog {
             }
             return Err(Refused::UnknownSender);
         };
-        let plaintext = self.sessions.open(sender, from, datagram)?;
-        let message: Message = codec::decode(plaintext).map_err(|_| Refused::Malformed)?;
+        let plaintext = self.sessions.open(sender, datagram)?;
+        let message: Result<Message, _> = codec::decode(plaintext);
+        // A host that moved, or whose NAT did, is followed to where its authentic and fresh datagrams come from.
+        self.sessions.paths.heard(sender, from, now, &mut self.out);
+        let message = message.map_err(|_| Refused::Malformed)?;
         if self.hosts.heard(host, now, &mut self.out) {
             self.welcome_back(host, sender, now);
         }
-        self.handle_message(host, sender, message, now)
+        self.handle_message((host, sender, from), message, now)
     }
 
     fn handle_message(
         &mut self,
-        host: HostId,
-        tag: Tag,
+        (host, tag, from): (HostId, Tag, SocketAddr),
         message: Message,
         now: Time,
     ) -> Result<(), Refused> {
@@ -204,6 +206,18 @@ impl Catalog {
                 self.tell_clock(tag, now);
             }
             Message::Ack(entries) => self.streams.handle_ack(tag, &entries, out),
+            Message::Probe { nonce } => out.send_by(tag, from, &Message::Probed { nonce }),
+            Message::Probed { nonce } => self.sessions.paths.answered(tag, nonce, now),
+            Message::Addresses {
+                revision,
+                control_addrs,
+            } => {
+                if control_addrs.len() > CONTROL_ADDRS_MAX {
+                    return Err(Refused::Malformed);
+                }
+                let news = (revision, control_addrs.as_slice());
+                self.sessions.paths.announced(tag, from, news, now, out);
+            }
             Message::Leave => {
                 self.hosts.left(host, now, &mut self.out);
                 self.end_life(tag, now);
@@ -215,10 +229,10 @@ impl Catalog {
     }
 }
 
-fn reader_addr(sessions: &Sessions, tag: Tag) -> Option<ReaderAddr> {
+pub(super) fn reader_addr(sessions: &Sessions, tag: Tag) -> Option<ReaderAddr> {
     let session = sessions.get(tag)?;
     Some(ReaderAddr {
-        data: session.data_addr,
+        data: sessions.data_addr(tag)?,
         multicast: session.multicast,
     })
 }

@@ -151,6 +151,23 @@ pub enum Message {
     Ack(Vec<AckEntry>),
     /// Goodbye: this life of the speaker is over.
     Leave,
+    /// Do you hear me at this address?
+    Probe {
+        /// To be repeated in the answer.
+        nonce: u64,
+    },
+    /// I do. Sent to where the probe came from.
+    Probed {
+        /// The nonce of the probe.
+        nonce: u64,
+    },
+    /// My control addresses are these now.
+    Addresses {
+        /// Counts the changes in this life of the speaker: only a higher one is news.
+        revision: u64,
+        /// All of them, at most four.
+        control_addrs: Vec<SocketAddr>,
+    },
 }
 
 /// How far one life of a host is known.
@@ -359,6 +376,18 @@ mod tests {
         bytes.clear();
         codec::encode(&Message::Leave, &mut bytes).unwrap();
         assert_eq!(bytes, [14]);
+        bytes.clear();
+        codec::encode(&Message::Probe { nonce: 9 }, &mut bytes).unwrap();
+        codec::encode(&Message::Probed { nonce: 9 }, &mut bytes).unwrap();
+        assert_eq!(bytes, [15, 9, 16, 9]);
+        let control_addrs = vec!["10.0.0.1:7".parse().unwrap()];
+        let addresses = Message::Addresses {
+            revision: 3,
+            control_addrs,
+        };
+        bytes.clear();
+        codec::encode(&addresses, &mut bytes).unwrap();
+        assert_eq!(bytes, [17, 3, 1, 0, 10, 0, 0, 1, 7]);
         let renewed = Message::Renewed {
             echo: Time(1),
             at: Time(2),

@@ -612,7 +612,7 @@ fn member(number: u8) -> Member {
 
 fn message(input: &mut Input<'_>) -> Message {
     let count = usize::from(input.byte() % 8);
-    match input.byte() % 15 {
+    match input.byte() % 18 {
         0 => Message::Swim(input.chunk().to_vec()),
         1 => Message::Ping {
             version: input.number(),
@@ -691,7 +691,17 @@ fn message(input: &mut Input<'_>) -> Message {
             };
             Message::Ack((0..count).map(entry).collect())
         }
-        _ => Message::Leave,
+        14 => Message::Leave,
+        15 => Message::Probe {
+            nonce: input.number(),
+        },
+        16 => Message::Probed {
+            nonce: input.number(),
+        },
+        _ => Message::Addresses {
+            revision: input.number(),
+            control_addrs: (0..count).map(|_| address(input.byte())).collect(),
+        },
     }
 }
 

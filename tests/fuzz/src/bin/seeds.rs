@@ -23,7 +23,7 @@ fn datagrams() -> Vec<Play> {
     let mut plays: Vec<(String, Vec<u8>)> = Vec::new();
     let mut play = |name: &str, bytes: &[&[u8]]| plays.push((name.to_owned(), bytes.concat()));
     // Act 4 is a message of a member: how many entries, which kind, then what each kind takes.
-    for kind in 0..15 {
+    for kind in 0..18 {
         play(
             &format!("message-{kind}"),
             &[&[4, 3, kind], &[1; 60], &[0], &[8, 232, 3]],
