@@ -1,4 +1,4 @@
-//! Sockets: the interfaces that this host uses, and the four sockets that it opens on them.
+//! Sockets: the interfaces that this host uses, and the four sockets that it opens, which outlive any of them.
 //!
 //! | socket | bound to | carries |
 //! |---|---|---|
@@ -9,16 +9,23 @@
 //!
 //! Samples have ports of their own, so that a foreign capture can count them.
 
+mod members;
+mod outlets;
 mod udp;
+mod watch;
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 
 use anyhow::{Context, bail};
 use if_addrs::{IfAddr, get_if_addrs};
+use rustix::net::netdevice::name_to_index;
 use socket2::{Domain, Protocol, SockRef, Socket, Type};
 
+pub(crate) use self::members::Members;
+pub(crate) use self::outlets::Outlets;
 pub(crate) use self::udp::Channel;
+pub(crate) use self::watch::Watch;
 
 /// Asked of the kernel for each socket that carries samples: the default holds 92 datagrams, one batch of a burst.
 const RECEIVE_BUFFER_BYTES: usize = 4 * 1024 * 1024;
@@ -27,6 +34,7 @@ const RECEIVE_BUFFER_BYTES: usize = 4 * 1024 * 1024;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Interface {
     pub(crate) name: String,
+    pub(crate) index: u32,
     pub(crate) address: Ipv4Addr,
 }
 
@@ -37,65 +45,71 @@ pub(crate) struct Sockets {
     pub(crate) beacon: Option<UdpSocket>,
     pub(crate) data: UdpSocket,
     pub(crate) group: UdpSocket,
-    pub(crate) interfaces: Vec<Interface>,
 }
 
-/// Finds the interfaces to use: those named (by name or address), else each with an address, else the loopback. One whose
-/// cable or radio is not there yet counts: a robot starts before its link does.
-pub(crate) fn interfaces(wanted: &[String]) -> anyhow::Result<Vec<Interface>> {
-    let all: Vec<(Interface, bool)> = get_if_addrs()
-        .context("listing the network interfaces")?
-        .into_iter()
-        .filter_map(|entry| {
-            let loopback = entry.is_loopback();
-            let IfAddr::V4(address) = entry.addr else {
-                return None;
-            };
-            Some((
-                Interface {
-                    name: entry.name,
-                    address: address.ip,
-                },
-                loopback,
-            ))
-        })
-        .collect();
-    if all.is_empty() {
+/// Finds the interfaces to use now: of those named (by name or address), else of all, the ones that are up, connected and
+/// have an address; if none is named, the loopback where there is no other. There may be none yet: a robot starts before
+/// its link does.
+pub(crate) fn interfaces(wanted: &[String]) -> io::Result<Vec<Interface>> {
+    let mut loopback = Vec::new();
+    let mut found = Vec::new();
+    for entry in get_if_addrs()? {
+        let (is_loopback, is_up) = (entry.is_loopback(), entry.is_oper_up());
+        let (IfAddr::V4(address), Some(index)) = (entry.addr, entry.index) else {
+            continue;
+        };
+        let interface = Interface {
+            name: entry.name,
+            index,
+            address: address.ip,
+        };
+        if !is_up {
+            continue;
+        }
+        if !wanted.is_empty() {
+            if wanted.iter().any(|want| interface.is(want)) {
+                found.push(interface);
+            }
+        } else if is_loopback {
+            loopback.push(interface);
+        } else {
+            found.push(interface);
+        }
+    }
+    Ok(if found.is_empty() { loopback } else { found })
+}
+
+/// Refuses a name that no interface has, be it up or not. An address may still come.
+pub(crate) fn check(wanted: &[String]) -> anyhow::Result<()> {
+    let socket = bind(0, false).context("opening a socket")?;
+    for want in wanted {
+        if want.parse::<Ipv4Addr>().is_ok() || name_to_index(&socket, want).is_ok() {
+            continue;
+        }
+        let all = get_if_addrs().context("listing the network interfaces")?;
+        let names: Vec<String> = all
+            .into_iter()
+            .filter_map(|entry| match entry.addr {
+                IfAddr::V4(address) => Some(format!("{} ({})", entry.name, address.ip)),
+                IfAddr::V6(_) => None,
+            })
+            .collect();
+        let there = if names.is_empty() {
+            "none has an IPv4 address yet".to_owned()
+        } else {
+            format!("there are {}", names.join(", "))
+        };
         bail!(
-            "no network interface is up with an IPv4 address\nhint: bring one up, or start without a key to serve this host alone"
+            "there is no interface `{want}`\nhint: {there}; one that is there but not up would be waited for"
         );
     }
-    if wanted.is_empty() {
-        let outside: Vec<Interface> = all
-            .iter()
-            .filter(|(_, loopback)| !loopback)
-            .map(|(i, _)| i.clone())
-            .collect();
-        return Ok(if outside.is_empty() {
-            all.into_iter().map(|(i, _)| i).collect()
-        } else {
-            outside
-        });
+    Ok(())
+}
+
+impl Interface {
+    fn is(&self, want: &str) -> bool {
+        self.name == want || self.address.to_string() == want
     }
-    wanted
-        .iter()
-        .map(|want| {
-            all.iter()
-                .map(|(interface, _)| interface)
-                .find(|i| i.name == *want || i.address.to_string() == *want)
-                .cloned()
-                .with_context(|| {
-                    let names: Vec<_> = all
-                        .iter()
-                        .map(|(i, _)| format!("{} ({})", i.name, i.address))
-                        .collect();
-                    format!(
-                        "no interface `{want}` is up\nhint: there are {}",
-                        names.join(", ")
-                    )
-                })
-        })
-        .collect()
 }
 
 impl Sockets {
@@ -104,7 +118,6 @@ impl Sockets {
     /// # Errors
     /// Names the port that is taken.
     pub(crate) fn open(
-        interfaces: Vec<Interface>,
         control_port: u16,
         data_port: u16,
         beacon: Option<SocketAddrV4>,
@@ -120,11 +133,9 @@ impl Sockets {
             .with_context(|| format!("opening the multicast socket on UDP port {group_port}, which something else holds alone"))?;
         let beacon = beacon
             .map(|beacon| {
-                let socket = bind(beacon.port(), true).with_context(|| {
+                bind(beacon.port(), true).with_context(|| {
                     format!("opening the beacon socket on UDP port {}, which something else holds alone", beacon.port())
-                })?;
-                join(&socket, *beacon.ip(), &interfaces)?;
-                anyhow::Ok(socket)
+                })
             })
             .transpose()?;
         for socket in [&data, &group] {
@@ -133,56 +144,12 @@ impl Sockets {
                 .set_recv_buffer_size(RECEIVE_BUFFER_BYTES)
                 .context("sizing a receive buffer")?;
         }
-        if let Some(first) = interfaces.first() {
-            for socket in [&control, &data] {
-                SockRef::from(socket)
-                    .set_multicast_if_v4(&first.address)
-                    .context("choosing the multicast interface")?;
-            }
-        }
         Ok(Self {
             control,
             beacon,
             data,
             group,
-            interfaces,
         })
-    }
-
-    /// The addresses at which the control socket is reached.
-    pub(crate) fn control_addrs(&self) -> io::Result<Vec<SocketAddr>> {
-        let port = self.control.local_addr()?.port();
-        Ok(self
-            .interfaces
-            .iter()
-            .map(|i| SocketAddr::from((i.address, port)))
-            .collect())
-    }
-}
-
-/// Makes `socket` receive the group on each interface. Being a member already is no error.
-pub(crate) fn join(
-    socket: &UdpSocket,
-    group: Ipv4Addr,
-    interfaces: &[Interface],
-) -> anyhow::Result<()> {
-    for interface in interfaces {
-        match socket.join_multicast_v4(&group, &interface.address) {
-            Err(e) if e.kind() != io::ErrorKind::AddrInUse => {
-                return Err(e).with_context(|| format!("joining {group} on {}", interface.name));
-            }
-            Ok(()) | Err(_) => {}
-        }
-    }
-    Ok(())
-}
-
-/// Undoes [`join`]; an interface that went away has left by itself.
-pub(crate) fn leave(socket: &UdpSocket, group: Ipv4Addr, interfaces: &[Interface]) {
-    for interface in interfaces {
-        if let Err(error) = socket.leave_multicast_v4(&group, &interface.address) {
-            tracing::debug!(%group, interface = %interface.name, %error, "group not left");
-        }
     }
 }
 
@@ -204,11 +171,21 @@ mod tests {
 
     #[test]
     fn an_unknown_interface_is_named_with_those_that_exist() {
-        let error = format!("{:#}", interfaces(&["nosuch0".to_owned()]).unwrap_err());
+        let error = format!("{:#}", check(&["nosuch0".to_owned()]).unwrap_err());
         assert!(
             error.contains("`nosuch0`") && error.contains("lo (127.0.0.1)"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn an_address_that_is_not_there_yet_is_waited_for() {
+        let wanted = ["lo".to_owned(), "192.0.2.1".to_owned()];
+
+        check(&wanted).unwrap();
+
+        let found = interfaces(&wanted[1..]).unwrap();
+        assert!(found.is_empty(), "{found:?}");
     }
 
     #[test]
@@ -222,11 +199,7 @@ mod tests {
     fn a_taken_data_port_is_named() {
         let taken = bind(0, false).unwrap();
         let port = taken.local_addr().unwrap().port();
-        let loopback = interfaces(&["lo".to_owned()]).unwrap();
-        let error = format!(
-            "{:#}",
-            Sockets::open(loopback, 0, port, None, 0).unwrap_err()
-        );
+        let error = format!("{:#}", Sockets::open(0, port, None, 0).unwrap_err());
         assert!(error.contains(&format!("UDP port {port}")), "{error}");
     }
 }

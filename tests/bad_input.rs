@@ -190,7 +190,7 @@ fn a_port_that_is_taken_is_named_with_a_way_out() {
 }
 
 #[test]
-fn without_a_network_interface_a_key_is_refused_and_the_host_serves_itself() {
+fn without_a_network_interface_the_host_serves_itself_and_waits() {
     let may = Command::new("unshare")
         .args(["--map-root-user", "--net", "true"])
         .status();
@@ -224,21 +224,30 @@ fn without_a_network_interface_a_key_is_refused_and_the_host_serves_itself() {
         command
     };
 
-    let refused = up(&["--key", &key]).output().unwrap();
+    for wanted in [&[][..], &["--iface", "lo"], &["--iface", "192.0.2.1"]] {
+        let arguments = [&["--key", &key], wanted].concat();
+        let mut waiting = Background(up(&arguments).spawn().unwrap());
+        let ready = first_line(&mut waiting.0);
+        assert!(ready.starts_with("ready: host h"), "{ready}");
+        assert!(
+            ready.contains("once a network interface is up: waiting for one"),
+            "{wanted:?}: {ready}"
+        );
+    }
+
+    // A name that nothing has is a mistake.
+    let refused = up(&["--key", &key, "--iface", "wlan7"]).output().unwrap();
     let said = text(&refused.stderr);
     assert_eq!(code(&refused), 1, "{said}");
     assert!(
-        said.contains("no network interface is up with an IPv4 address"),
-        "{said}"
-    );
-    assert!(
-        said.contains("\nhint: bring one up, or start without a key to serve this host alone"),
+        said.contains("there is no interface `wlan7`") && said.contains("\nhint: "),
         "{said}"
     );
 
     let mut alone = Background(up(&[]).spawn().unwrap());
     let ready = first_line(&mut alone.0);
     assert!(ready.starts_with("ready: host h"), "{ready}");
+    assert!(ready.contains("no key, no network"), "{ready}");
 }
 
 #[test]

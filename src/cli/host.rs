@@ -23,7 +23,15 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         return Ok(Exit::Done);
     }
     let now = ddx_store::now();
-    let mut table = Table::new(&["HOST", "STATE", "SINCE", "ROUND TRIP", "ADDRESS", "ID"]);
+    let mut table = Table::new(&[
+        "HOST",
+        "STATE",
+        "SINCE",
+        "ROUND TRIP",
+        "LOSS",
+        "ADDRESS",
+        "ID",
+    ]);
     for host in state::hosts(&store)? {
         let ago = host.since.map(|since| span(now.0.saturating_sub(since)));
         table.row(vec![
@@ -32,7 +40,9 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
             ago.unwrap_or_else(unknown),
             host.rtt_us
                 .map_or_else(unknown, |us| span(us.saturating_mul(1_000))),
-            host.addr.unwrap_or_else(unknown),
+            host.loss_percent
+                .map_or_else(unknown, |percent| format!("{percent:.1} %")),
+            address(host.addr, host.paths.len()),
             host.id,
         ]);
     }
@@ -45,6 +55,15 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         );
     }
     Ok(Exit::Done)
+}
+
+/// The address in use, and how many others there are.
+fn address(used: Option<String>, paths: usize) -> String {
+    let used = used.unwrap_or_else(unknown);
+    match paths {
+        0 | 1 => used,
+        several => format!("{used} (of {several})"),
+    }
 }
 
 fn unknown() -> String {

@@ -22,6 +22,12 @@ pub(crate) struct Host {
     /// Round trip, microseconds.
     #[serde(default)]
     pub(crate) rtt_us: Option<u64>,
+    /// Share of probes that were not answered; none where there is only one address to use.
+    #[serde(default)]
+    pub(crate) loss_percent: Option<f64>,
+    /// The addresses that were found for it.
+    #[serde(default)]
+    pub(crate) paths: Vec<serde::de::IgnoredAny>,
     /// Since when it is in this state: nanoseconds on this host's clock.
     #[serde(default)]
     pub(crate) since: Option<u64>,

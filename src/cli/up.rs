@@ -27,7 +27,7 @@ pub(crate) struct Args {
     /// File with the domain key; without one nothing is sent or listened to on any network
     #[arg(long, value_name = "FILE")]
     key: Option<PathBuf>,
-    /// Network interface to use, by name or address; may be repeated [default: each that is up]
+    /// Network interface to use, by name or address; may be repeated; may come up later [default: each that is up]
     #[arg(long, value_name = "NAME")]
     iface: Vec<String>,
     /// Host to ask at the start, as `udp/host:port`; may be repeated
@@ -111,6 +111,9 @@ fn read_key(path: &Path) -> Result<DomainKey, Failure> {
 /// Tells people, programs and systemd that this host serves.
 fn announce(out: &mut Output, ready: &Ready) -> anyhow::Result<()> {
     let network = match ready.data_port {
+        Some(port) if ready.control.is_empty() => {
+            format!("samples on UDP port {port}, once a network interface is up: waiting for one")
+        }
         Some(port) => format!("samples on UDP port {port}"),
         None => "no key, no network".to_owned(),
     };

@@ -268,6 +268,8 @@ mod tests {
             state: state.to_owned(),
             addr: None,
             rtt_us: None,
+            loss_percent: None,
+            paths: Vec::new(),
             since: Some(NOW_NS - 4_000_000_000),
         }
     }

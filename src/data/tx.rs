@@ -5,7 +5,6 @@
 
 use std::collections::HashMap;
 use std::io;
-use std::net::UdpSocket;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
@@ -86,7 +85,7 @@ struct Stream {
 impl Tx {
     /// Starts the thread. `store` is a connection of its own, whose bell the thread sleeps on.
     pub(crate) fn start(
-        socket: UdpSocket,
+        channel: Channel,
         store: &Store,
         sealer: Sealer,
         traffic: Arc<Traffic>,
@@ -96,7 +95,6 @@ impl Tx {
             mailbox::mailbox(ORDERS).context("making the queue of the sending thread")?;
         let set = WaitSet::new(store);
         let waker = set.waker();
-        let channel = Channel::new(socket)?;
         let config = SenderConfig {
             segments_max: channel.max_segments(),
             ..SenderConfig::default()

@@ -2,17 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::net::{SocketAddr, SocketAddrV4, ToSocketAddrs};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, ToSocketAddrs};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ddx_catalog::delivery::{ReceiverConfig, ReceiverCounters, Route};
+use ddx_catalog::delivery::{Path, ReceiverConfig, ReceiverCounters, Route};
 use ddx_catalog::{Catalog, Config as CatalogConfig, Dest, Event, beacon_group, sample_group};
 use ddx_store::server::{Event as StoreEvent, Handle, RemoteItem};
 use ddx_store::{ReaderOptions, Schema, Store, WriterOptions};
 use ddx_wire::seal::{DomainKey, Purpose, Sealer};
 use ddx_wire::{HostId, HostName, ItemDescription, ItemName, StreamId, Tag};
+use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::{UdpSocket, UnixStream};
 use tokio::time::sleep;
@@ -23,7 +24,7 @@ use crate::data::rx::{self, MirrorId, Rx};
 use crate::data::tx::{self, Tx};
 use crate::data::{Traffic, count};
 use crate::identity::{Identity, random};
-use crate::net::{self, Sockets};
+use crate::net::{self, Channel, Interface, Members, Outlets, Sockets, Watch};
 
 /// Notices from the receiving thread that wait at most; one more costs an acknowledgement that a renewal makes good.
 const NOTICES: usize = 4096;
@@ -39,9 +40,14 @@ pub(super) struct Network {
     handle: Handle,
     control: UdpSocket,
     beacon: Option<UdpSocket>,
-    group: std::net::UdpSocket,
     beacon_to: SocketAddr,
-    interfaces: Vec<net::Interface>,
+    watch: Watch,
+    /// Names or addresses of the interfaces to use; empty for all.
+    wanted: Vec<String>,
+    interfaces: Vec<Interface>,
+    beacon_members: Option<Members>,
+    group_members: Members,
+    outlets: Outlets,
     control_addrs: Vec<SocketAddr>,
     data_port: u16,
     tx: Tx,
@@ -79,15 +85,27 @@ impl Network {
         handle: &Handle,
     ) -> anyhow::Result<Self> {
         let beacon_to = beacon_group(config.domain);
-        let interfaces = net::interfaces(&config.interfaces)?;
+        net::check(&config.interfaces)?;
         let sockets = Sockets::open(
-            interfaces,
             config.control_port,
             config.data_port,
             v4(beacon_to).filter(|_group| config.beacon),
             sample_group(config.domain, 0).port(),
         )?;
-        let control_addrs = sockets.control_addrs()?;
+        // Before the first look, so that nothing changes in between.
+        let watch = Watch::start();
+        let interfaces =
+            net::interfaces(&config.interfaces).context("listing the network interfaces")?;
+        let control_addrs = control_addrs(&interfaces, sockets.control.local_addr()?.port());
+        say(&interfaces);
+        let group_members = Members::new(sockets.group.try_clone()?, &interfaces);
+        let mut beacon_members = None;
+        if let (Some(socket), Some(group)) = (&sockets.beacon, v4(beacon_to)) {
+            let members = beacon_members.insert(Members::new(socket.try_clone()?, &interfaces));
+            members.join(*group.ip());
+        }
+        let outlets = Outlets::default();
+        outlets.follow(&interfaces);
         let data_port = sockets.data.local_addr()?.port();
         let seeds = config
             .join
@@ -121,7 +139,7 @@ impl Network {
         let sealer = Sealer::new(key, identity.id, identity.incarnation, Purpose::Data);
         let receiver = ReceiverConfig::new(sealer.sender(), key.id());
         let tx = Tx::start(
-            sockets.data.try_clone()?,
+            Channel::new(sockets.data.try_clone()?)?.with_outlets(outlets.clone()),
             &tx_store,
             sealer,
             Arc::clone(&traffic),
@@ -129,7 +147,7 @@ impl Network {
         )?;
         let rx = Rx::start(
             sockets.data,
-            sockets.group.try_clone()?,
+            sockets.group,
             receiver,
             notify,
             Arc::clone(&traffic),
@@ -143,9 +161,13 @@ impl Network {
             handle: handle.clone(),
             control: UdpSocket::from_std(sockets.control)?,
             beacon: sockets.beacon.map(UdpSocket::from_std).transpose()?,
-            group: sockets.group,
             beacon_to,
-            interfaces: sockets.interfaces,
+            watch,
+            wanted: config.interfaces.clone(),
+            interfaces,
+            beacon_members,
+            group_members,
+            outlets,
             control_addrs,
             data_port,
             tx,
@@ -178,6 +200,7 @@ impl Network {
             ready = self.control.readable() => ready?,
             ready = readable(self.beacon.as_ref()) => ready?,
             ready = self.notified.readable() => ready?,
+            () = self.watch.changed() => self.follow_interfaces(),
             () = sleep(wait.unwrap_or_default()), if wait.is_some() => self.catalog.handle_timeout(ddx_store::now()),
         }
         self.receive();
@@ -213,6 +236,32 @@ impl Network {
             }
         }
         self.settle()
+    }
+
+    /// Goes on with the interfaces that there are now.
+    fn follow_interfaces(&mut self) {
+        let interfaces = match net::interfaces(&self.wanted) {
+            Ok(interfaces) => interfaces,
+            Err(error) => {
+                tracing::warn!(%error, "the network interfaces cannot be listed");
+                return;
+            }
+        };
+        if interfaces == self.interfaces {
+            return;
+        }
+        say(&interfaces);
+        self.group_members.follow(&interfaces);
+        if let Some(members) = &mut self.beacon_members {
+            members.follow(&interfaces);
+        }
+        self.outlets.follow(&interfaces);
+        self.interfaces = interfaces;
+        if let Ok(at) = self.control.local_addr() {
+            self.control_addrs = control_addrs(&self.interfaces, at.port());
+            self.catalog
+                .set_control_addrs(&self.control_addrs, ddx_store::now());
+        }
     }
 
     /// Tells the other hosts of an item of this one. Administrative items are each host's own.
@@ -341,19 +390,33 @@ impl Network {
             let Some(transmit) = self.catalog.poll_transmit(&mut datagram) else {
                 return;
             };
-            let to = match transmit.to {
-                Dest::Addr(to) => to,
-                Dest::Beacon => self.beacon_to,
-            };
-            match self.control.try_send_to(&datagram, to) {
-                Ok(bytes) => {
-                    count(&self.control_traffic.sent_datagrams, 1);
-                    count(&self.control_traffic.sent_bytes, bytes);
+            match transmit.to {
+                Dest::Addr(to) => self.send(to, None, &datagram),
+                Dest::Beacon => {
+                    for (index, interface) in self.interfaces.iter().enumerate() {
+                        // Once for each interface, whatever the number of its addresses.
+                        let before = self.interfaces.iter().take(index);
+                        if before.into_iter().all(|i| i.index != interface.index) {
+                            self.send(self.beacon_to, Some(interface.address), &datagram);
+                        }
+                    }
                 }
-                Err(error) => {
-                    count(&self.control_traffic.unsent_datagrams, 1);
-                    tracing::debug!(%to, %error, "sending a control datagram");
-                }
+            }
+        }
+    }
+
+    fn send(&self, to: SocketAddr, from: Option<Ipv4Addr>, datagram: &[u8]) {
+        let chosen = from.map_or(Ok(()), |from| {
+            SockRef::from(&self.control).set_multicast_if_v4(&from)
+        });
+        match chosen.and_then(|()| self.control.try_send_to(datagram, to)) {
+            Ok(bytes) => {
+                count(&self.control_traffic.sent_datagrams, 1);
+                count(&self.control_traffic.sent_bytes, bytes);
+            }
+            Err(error) => {
+                count(&self.control_traffic.unsent_datagrams, 1);
+                tracing::debug!(%to, %error, "sending a control datagram");
             }
         }
     }
@@ -409,9 +472,13 @@ impl Network {
                 route,
             } => self.open_stream(stream, &name, route)?,
             Event::UpdateStream { stream, route } => {
+                self.follow_route(stream, &route);
                 self.tx.order(tx::Order::Update { stream, route })?;
             }
-            Event::CloseStream { stream } => self.tx.order(tx::Order::Close(stream))?,
+            Event::CloseStream { stream } => {
+                self.outlets.route(stream, None, std::iter::empty());
+                self.tx.order(tx::Order::Close(stream))?;
+            }
             Event::Held {
                 stream,
                 tag,
@@ -443,12 +510,12 @@ impl Network {
             }
             Event::JoinGroup(group) => {
                 if let Some(group) = v4(group) {
-                    net::join(&self.group, *group.ip(), &self.interfaces)?;
+                    self.group_members.join(*group.ip());
                 }
             }
             Event::LeaveGroup(group) => {
                 if let Some(group) = v4(group) {
-                    net::leave(&self.group, *group.ip(), &self.interfaces);
+                    self.group_members.leave(*group.ip());
                 }
             }
             Event::Clock { tag, offset } => {
@@ -477,11 +544,21 @@ impl Network {
                 return Ok(());
             }
         };
+        self.follow_route(stream, &route);
         self.tx.order(tx::Order::Open {
             stream,
             route,
             reader: Box::new(reader),
         })
+    }
+
+    fn follow_route(&self, stream: StreamId, route: &Route) {
+        let group = match route.path {
+            Path::Unicast => None,
+            Path::Multicast(group) | Path::Both(group) => Some(group),
+        };
+        let readers = route.readers.iter().map(|reader| reader.addr);
+        self.outlets.route(stream, group, readers);
     }
 
     /// Makes ready for the samples of a stream: a mirror in the store, and the order to write it.
@@ -581,6 +658,25 @@ async fn readable(socket: Option<&UdpSocket>) -> io::Result<()> {
         Some(socket) => socket.readable().await,
         None => std::future::pending().await,
     }
+}
+
+/// The addresses at which the control socket is reached.
+fn control_addrs(interfaces: &[Interface], port: u16) -> Vec<SocketAddr> {
+    let addrs = interfaces.iter();
+    addrs
+        .map(|interface| SocketAddr::from((interface.address, port)))
+        .collect()
+}
+
+/// Tells people which interfaces are in use.
+fn say(interfaces: &[Interface]) {
+    if interfaces.is_empty() {
+        tracing::warn!("no network interface is up with an IPv4 address: waiting for one");
+        return;
+    }
+    let all = interfaces.iter();
+    let all: Vec<String> = all.map(|i| format!("{} ({})", i.name, i.address)).collect();
+    tracing::info!(interfaces = %all.join(", "), "network");
 }
 
 fn v4(addr: SocketAddr) -> Option<SocketAddrV4> {

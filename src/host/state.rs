@@ -3,7 +3,7 @@
 //! | item | what it holds |
 //! |---|---|
 //! | `@/self` | this host: name, id, domain, whether there is a key, addresses, ports |
-//! | `@/hosts` | the other hosts: name, id, state, address, round trip, since when |
+//! | `@/hosts` | the other hosts: name, id, state, address in use, round trip, loss, all paths, since when |
 //! | `@/routes` | streams out and in: item, peers, path, group, rate |
 //! | `@/clock` | offset and bound of each other host's clock, nanoseconds |
 //! | `@/counters` | name to count: datagrams, bytes, drops by reason |
@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::Context as _;
 use ddx_catalog::delivery::Path;
-use ddx_catalog::{HostState, HostStatus, StreamIn, StreamOut};
+use ddx_catalog::{HostState, HostStatus, PathStatus, StreamIn, StreamOut};
 use ddx_store::server::Handle;
 use ddx_store::{RawWriter, Schema, Store, WriterOptions};
 use ddx_wire::seal::Refused;
@@ -72,7 +72,10 @@ impl Publisher {
 
     /// Writes what changed since the last time.
     pub(super) fn publish(&mut self, network: Option<&Network>) {
-        let own = self.own.clone();
+        let mut own = self.own.clone();
+        if let Some(network) = network {
+            own["control"] = json!(network.control_addrs());
+        }
         self.write("@/self", &own);
         let hosts = network.map(|n| n.catalog().hosts()).unwrap_or_default();
         self.write("@/hosts", &hosts.iter().map(host).collect());
@@ -149,7 +152,30 @@ fn host(status: &HostStatus) -> Value {
         "state": state,
         "addr": status.addr,
         "rtt_us": status.rtt.map(|rtt| rtt.as_micros()),
+        "loss_percent": used(status).map(loss_percent),
+        "paths": status.paths.iter().map(path_to).collect::<Vec<_>>(),
         "since": status.since.0,
+    })
+}
+
+/// The path in use, if it is measured.
+fn used(status: &HostStatus) -> Option<&PathStatus> {
+    status
+        .paths
+        .iter()
+        .find(|path| path.used && path.rtt.is_some())
+}
+
+fn loss_percent(path: &PathStatus) -> f64 {
+    f64::from(path.loss_permille) / 10.0
+}
+
+fn path_to(path: &PathStatus) -> Value {
+    json!({
+        "addr": path.addr,
+        "used": path.used,
+        "rtt_us": path.rtt.map(|rtt| rtt.as_micros()),
+        "loss_percent": path.rtt.map(|_measured| loss_percent(path)),
     })
 }
 

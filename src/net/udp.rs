@@ -1,9 +1,11 @@
 //! One socket that carries samples in batches: GSO on the way out, GRO on the way in (`quinn-udp`).
 
 use std::io::{self, IoSliceMut};
-use std::net::{SocketAddr, UdpSocket};
+use std::net::{IpAddr, SocketAddr, UdpSocket};
 
 use quinn_udp::{RecvMeta, Transmit, UdpSockRef, UdpSocketState};
+
+use super::Outlets;
 
 /// Buffers filled by one system call.
 const RECEIVE_BATCH: usize = 16;
@@ -22,6 +24,7 @@ pub(crate) struct Batch {
 pub(crate) struct Channel {
     socket: UdpSocket,
     state: UdpSocketState,
+    outlets: Outlets,
     buffers: Vec<u8>,
 }
 
@@ -31,26 +34,49 @@ impl Channel {
         Ok(Self {
             socket,
             state,
+            outlets: Outlets::default(),
             buffers: Vec::new(),
         })
     }
 
-    /// Sends one datagram, or a run of equal ones of `segment` bytes. A full queue is the error `WouldBlock`.
+    /// The same, sending to groups by these interfaces.
+    pub(crate) fn with_outlets(self, outlets: Outlets) -> Self {
+        Self { outlets, ..self }
+    }
+
+    /// Sends one datagram, or a run of equal ones of `segment` bytes; to a group, by each of its interfaces. A full queue is
+    /// the error `WouldBlock`.
     pub(crate) fn send(
         &self,
         to: SocketAddr,
         contents: &[u8],
         segment: Option<usize>,
     ) -> io::Result<()> {
-        let transmit = Transmit {
-            destination: to,
-            ecn: None,
-            contents,
-            segment_size: segment,
-            src_ip: None,
+        let send = |source: Option<IpAddr>| {
+            let transmit = Transmit {
+                destination: to,
+                ecn: None,
+                contents,
+                segment_size: segment,
+                // Of a multicast datagram this decides the interface, too.
+                src_ip: source,
+            };
+            self.state
+                .try_send(UdpSockRef::from(&self.socket), &transmit)
         };
-        self.state
-            .try_send(UdpSockRef::from(&self.socket), &transmit)
+        if !to.ip().is_multicast() {
+            return send(None);
+        }
+        let sources = self.outlets.sources(to.ip());
+        if sources.is_empty() {
+            return send(None);
+        }
+        // One interface that fails does not keep the others from it.
+        let mut sent = Ok(());
+        for source in sources {
+            sent = sent.and(send(Some(source.into())));
+        }
+        sent
     }
 
     /// Most datagrams in one run.
