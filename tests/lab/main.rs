@@ -6,6 +6,7 @@
 //! | `interest.rs` | nothing is sent until somebody reads, then once, and no longer than somebody reads |
 //! | `hosts.rs` | hosts join, leave, die, are cut off, and come back; a host without a network is whole |
 //! | `load.rs` | the books balance under load, and the last value arrives under loss |
+//! | `paths.rs` | samples flow on when interfaces come, go and change address |
 //! | `why.rs` | `ddx why` names the cause |
 
 #![expect(
@@ -16,6 +17,7 @@
 mod hosts;
 mod interest;
 mod load;
+mod paths;
 mod program;
 mod site;
 mod why;

@@ -95,6 +95,7 @@ impl Play {
             seed,
             hosts,
             link,
+            networks: 1,
             beacon: random.chance(0.7),
             drift_ppm: u32::try_from(random.below(100)).unwrap(),
             lag: if calm {

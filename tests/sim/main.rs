@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `directory.rs` | everybody learns everything, soon, also after a partition; nobody alive is declared dead; idling is cheap |
 //! | `delivery.rs` | the last value arrives; nothing is sent twice, too often, to nobody or too large |
+//! | `paths.rs` | samples flow on when an address, a link or a network of several goes |
 //! | `chance.rs` | the same under whatever a seed thinks up, with each sample judged |
 //!
 //! A failure prints its seed and the line that replays it. `DDX_SEED=n` runs that seed alone, `DDX_SEEDS=n` runs as many
@@ -17,6 +18,7 @@
 mod chance;
 mod delivery;
 mod directory;
+mod paths;
 mod seeds;
 
 use std::time::Duration;

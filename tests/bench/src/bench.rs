@@ -4,7 +4,7 @@ use anyhow::Result;
 
 use crate::programs::Programs;
 use crate::table::Table;
-use crate::{cost, local, network};
+use crate::{cost, fallover, local, network};
 
 /// A run of the bench.
 pub(crate) struct Bench {
@@ -31,6 +31,7 @@ pub(crate) const LINES: &[Line] = &[
     ("spin", network::spin),
     ("idle", network::idle),
     ("cold", network::cold),
+    ("fallover", fallover::fallover),
 ];
 
 impl Bench {

@@ -22,6 +22,7 @@ use crate::table::Table;
 mod bench;
 mod contender;
 mod cost;
+mod fallover;
 mod floor;
 mod local;
 mod network;
@@ -49,7 +50,7 @@ struct Run {
     /// Print one JSON document
     #[arg(long)]
     json: bool,
-    /// Lines to measure: write wake poll large readers memory hosts spin idle cold [default: all]
+    /// Lines to measure: write wake poll large readers memory hosts spin idle cold fallover [default: all]
     lines: Vec<String>,
 }
 

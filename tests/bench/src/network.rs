@@ -20,7 +20,7 @@ const UDP_PORT: u16 = 7001;
 const RELAY_PORT: u16 = 7002;
 const ITEMS: usize = 100;
 /// Longer than anything here takes.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// `hosts`: 64 bytes from a writer on one host to a blocked reader on another.
 pub(crate) fn hosts(bench: &mut Bench) -> Result<()> {
@@ -164,7 +164,7 @@ fn give_key(lab: &Lab, programs: &Programs) -> Result<()> {
 }
 
 /// Starts a daemon on each host and waits until they serve.
-fn start_daemons(lab: &Lab, programs: &Programs, spin: bool) -> Result<Vec<Process>> {
+pub(crate) fn start_daemons(lab: &Lab, programs: &Programs, spin: bool) -> Result<Vec<Process>> {
     give_key(lab, programs)?;
     let mut daemons = Vec::new();
     for host in lab.hosts() {
@@ -184,6 +184,6 @@ fn start_daemon(host: Host<'_>, programs: &Programs, spin: bool) -> Result<Proce
     Ok(host.spawn(&command)?)
 }
 
-fn play(host: Host<'_>, programs: &Programs, part: &[&str]) -> Result<Process> {
+pub(crate) fn play(host: Host<'_>, programs: &Programs, part: &[&str]) -> Result<Process> {
     Ok(host.spawn(Command::new(&programs.own).arg("role").args(part))?)
 }

@@ -13,6 +13,7 @@ use ddx_store::{Reader, Store};
 use ring::aead::{AES_256_GCM, Aad, LessSafeKey, Nonce, UnboundKey};
 
 use crate::contender::{Copies, CopiesReader};
+use crate::fallover;
 use crate::floor::{FloorReader, FloorWriter, Shared, WORDS};
 use crate::pair::{Send64, Take64, now_ns};
 
@@ -33,6 +34,8 @@ pub(crate) enum Role {
     Items { count: usize },
     /// Reads an item once, and tells how long after the opening of its reader that was.
     First { name: String },
+    /// Reads an item for a while, and tells the longest pause between two of its samples.
+    Pause { name: String },
     /// Sends stamps.
     #[command(subcommand)]
     Source(Way),
@@ -70,6 +73,7 @@ impl Role {
             }
             Self::Items { count } => items(count),
             Self::First { name } => first(&name),
+            Self::Pause { name } => fallover::pause(&name),
             Self::Source(way) => source(way.sender()?),
             Self::Sink { count, way } => sink(count, way.taker()?),
             Self::RelayOut { path, to } => relay_out(Shared::open(&path)?, to),

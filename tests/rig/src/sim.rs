@@ -18,6 +18,7 @@ use ddx_wire::{
 
 mod host;
 mod net;
+mod networks;
 mod random;
 mod rx;
 mod store;
@@ -27,6 +28,7 @@ pub use host::Host;
 use host::HostClock;
 pub use net::Link;
 use net::{CONTROL_PORT, DATA_PORT, Net, Way};
+use networks::Networks;
 pub use random::Random;
 pub use tx::Counts;
 
@@ -42,6 +44,8 @@ pub struct Setup {
     pub hosts: usize,
     /// The network.
     pub link: Link,
+    /// How many such networks there are; each host has an address on each.
+    pub networks: usize,
     /// Whether beacons reach everybody; else all hosts have the first as a seed.
     pub beacon: bool,
     /// Greatest drift of a clock, parts per million, either way.
@@ -58,6 +62,7 @@ pub struct Sim {
     count: u64,
     queue: BinaryHeap<Reverse<(u64, u64, Action)>>,
     net: Net,
+    networks: Networks,
     hosts: Vec<Host>,
     tags: BTreeMap<Tag, usize>,
     interest: BTreeMap<ItemName, Interest>,
@@ -88,6 +93,7 @@ enum Action {
     Deliver {
         to: usize,
         from: usize,
+        network: usize,
         way: Way,
         bytes: Vec<u8>,
     },
@@ -100,6 +106,7 @@ impl Setup {
             seed,
             hosts,
             link: Link::lan(loss),
+            networks: 1,
             beacon: true,
             drift_ppm: 90,
             lag: Duration::ZERO,
@@ -112,6 +119,7 @@ impl Sim {
     pub fn new(setup: Setup) -> Self {
         let mut random = Random::new(setup.seed);
         let net = Net::new(setup.link, Random::new(random.next()), setup.hosts);
+        let networks = Networks::new(setup.hosts, setup.networks);
         let mut hosts = Vec::new();
         for index in 0..setup.hosts {
             let name = HostName::parse(&format!("h{index}")).expect("letter and digits are a name");
@@ -131,6 +139,7 @@ impl Sim {
             count: 0,
             queue: BinaryHeap::new(),
             net,
+            networks,
             hosts,
             tags: BTreeMap::new(),
             interest: BTreeMap::new(),
@@ -156,7 +165,7 @@ impl Sim {
         let seeds = if self.setup.beacon || index == 0 {
             Vec::new()
         } else {
-            vec![net::address(0, CONTROL_PORT)]
+            self.networks.addresses(0, CONTROL_PORT)
         };
         let config = Config {
             domain: DomainId(3),
@@ -164,7 +173,7 @@ impl Sim {
             id: host.id,
             incarnation: Incarnation { ordinal, random },
             key: host::key(),
-            control_addrs: vec![net::address(index, CONTROL_PORT)],
+            control_addrs: self.networks.addresses(index, CONTROL_PORT),
             data_port: DATA_PORT,
             seeds,
             beacon: self.setup.beacon,
@@ -221,6 +230,37 @@ impl Sim {
     /// Ends a split.
     pub fn heal(&mut self) {
         self.net.cut(|_| 0);
+    }
+
+    /// Lets nothing pass on the link of a host to a network, or lets it pass again. The host is not told.
+    pub fn silence(&mut self, index: usize, network: usize, silent: bool) {
+        self.networks.silence(index, network, silent);
+    }
+
+    /// Takes a host from a network, or back, as when its interface goes down or up.
+    pub fn plug(&mut self, index: usize, network: usize, plugged: bool) {
+        self.networks.plug(index, network, plugged);
+        self.tell_addresses(index);
+    }
+
+    /// Gives a host another address on a network.
+    pub fn readdress(&mut self, index: usize, network: usize) {
+        self.networks.readdress(index, network);
+        self.tell_addresses(index);
+    }
+
+    fn tell_addresses(&mut self, index: usize) {
+        let addresses = self.networks.addresses(index, CONTROL_PORT);
+        self.command(index, |catalog, now| {
+            catalog.set_control_addrs(&addresses, now);
+        });
+    }
+
+    /// The network on which a host sends to another now.
+    pub fn network(&self, from: usize, to: usize) -> Option<usize> {
+        let hosts = self.hosts[from].catalog.as_ref()?.hosts();
+        let peer = hosts.iter().find(|host| host.host == self.hosts[to].id)?;
+        Some(self.networks.resolve(peer.addr)?.1)
     }
 
     /// Changes the network for datagrams that are sent from now on.
@@ -322,9 +362,10 @@ impl Sim {
                 Action::Deliver {
                     to,
                     from,
+                    network,
                     way,
                     bytes,
-                } => self.deliver(to, from, way, bytes),
+                } => self.deliver(to, (from, network), way, bytes),
             }
         }
     }
@@ -339,21 +380,28 @@ impl Sim {
         self.settle(index);
     }
 
-    fn deliver(&mut self, to: usize, from: usize, way: Way, mut bytes: Vec<u8>) {
+    fn deliver(
+        &mut self,
+        to: usize,
+        (from, network): (usize, usize),
+        way: Way,
+        mut bytes: Vec<u8>,
+    ) {
         let now = self.moment(to);
         let host = &mut self.hosts[to];
         let listens = match way {
             Way::Control | Way::Unicast => true,
             Way::Group(group) => host.hears_groups && host.joined.contains(&group),
         };
-        if !listens || host.catalog.is_none() || !self.net.reaches(from, to) {
+        let arrives = self.net.reaches(from, to) && self.networks.carries(to, network);
+        if !listens || host.catalog.is_none() || !arrives {
             return;
         }
         self.delivered += 1;
         match way {
             Way::Control => {
                 if let Some(catalog) = &mut host.catalog {
-                    let addr = net::address(from, CONTROL_PORT);
+                    let addr = self.networks.address(from, network, CONTROL_PORT);
                     catalog.handle_datagram(addr, &mut bytes, now.local);
                 }
             }
@@ -390,8 +438,10 @@ impl Sim {
             match to {
                 Dest::Addr(to) => self.send(index, to, &bytes),
                 Dest::Beacon => {
-                    for to in (0..self.hosts.len()).filter(|to| *to != index) {
-                        self.post(index, to, Way::Control, &bytes);
+                    for network in 0..self.networks.count() {
+                        for to in (0..self.hosts.len()).filter(|to| *to != index) {
+                            self.post((index, network), to, Way::Control, &bytes);
+                        }
                     }
                 }
             }
@@ -437,16 +487,23 @@ impl Sim {
         }
         if to.ip().is_multicast() {
             // The sender hears its own, too, if it is a member.
-            for member in 0..self.hosts.len() {
-                self.post(from, member, Way::Group(to), bytes);
+            for network in 0..self.networks.count() {
+                for member in 0..self.hosts.len() {
+                    self.post((from, network), member, Way::Group(to), bytes);
+                }
             }
-        } else if let Some((to, way)) = net::socket(to) {
-            self.post(from, to, way, bytes);
+        } else if let Some((first, network)) = self.networks.resolve(to)
+            && let Some((to, way)) = net::socket(first)
+        {
+            self.post((from, network), to, way, bytes);
         }
     }
 
-    fn post(&mut self, from: usize, to: usize, way: Way, bytes: &[u8]) {
-        if !self.net.reaches(from, to) {
+    fn post(&mut self, (from, network): (usize, usize), to: usize, way: Way, bytes: &[u8]) {
+        let carried = [from, to]
+            .iter()
+            .all(|host| self.networks.carries(*host, network));
+        if !self.net.reaches(from, to) || !carried {
             return;
         }
         for span in self.net.copies() {
@@ -454,6 +511,7 @@ impl Sim {
             let action = Action::Deliver {
                 to,
                 from,
+                network,
                 way,
                 bytes,
             };

@@ -88,6 +88,24 @@ impl<'lab> Host<'lab> {
         }
     }
 
+    /// Gives the host a further link, to another switch, which is made with the first of its links.
+    ///
+    /// The interface is down and has no address; the other end is `SWITCHpN` in the switch's namespace, N counting hosts
+    /// from 1. The links of such a switch are neither counted nor cut by the methods here, and it floods multicast.
+    ///
+    /// # Errors
+    /// [`Error::Step`] if the names do not suit the kernel or are in use.
+    pub fn plug(&self, interface: &str, switch: &str) -> Result<(), Error> {
+        let (port, holder) = (self.index + 1, self.lab.holders[self.index]);
+        let script = format!(
+            "ip link show {switch} >/dev/null 2>&1 || ip link add {switch} up type bridge mcast_snooping 0\n\
+             ip link add {switch}p{port} type veth peer name {interface} netns {holder}\n\
+             ip link set {switch}p{port} master {switch} up\n"
+        );
+        self.lab.switch(&script)?;
+        Ok(())
+    }
+
     /// Cuts the link: nothing passes either way, and the host is not told.
     ///
     /// # Errors
