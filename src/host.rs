@@ -218,7 +218,7 @@ impl Daemon {
                 .unwrap_or_default(),
             data_port: network.as_ref().map(Network::data_port),
         };
-        let publisher = Publisher::new(&handle, identity, &ready)?;
+        let publisher = Publisher::new(&handle, identity, &ready, config, network.as_ref())?;
         Ok(Self {
             ready,
             handle,

@@ -28,7 +28,7 @@ pub(crate) use self::udp::Channel;
 pub(crate) use self::watch::Watch;
 
 /// Asked of the kernel for each socket that carries samples: the default holds 92 datagrams, one batch of a burst.
-const RECEIVE_BUFFER_BYTES: usize = 4 * 1024 * 1024;
+pub(crate) const RECEIVE_BUFFER_BYTES: usize = 4 * 1024 * 1024;
 
 /// One IPv4 address of this host on one interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -139,7 +139,7 @@ impl Sockets {
             })
             .transpose()?;
         for socket in [&data, &group] {
-            // The kernel cuts this to its limit without an error; `ddx doctor` will show what was granted.
+            // The kernel cuts this to its limit without an error; `ddx doctor` shows what was granted.
             SockRef::from(socket)
                 .set_recv_buffer_size(RECEIVE_BUFFER_BYTES)
                 .context("sizing a receive buffer")?;
@@ -151,6 +151,11 @@ impl Sockets {
             group,
         })
     }
+}
+
+/// How many bytes may wait in a socket, as they are asked for: the kernel says twice that, for its own books.
+pub(crate) fn receive_buffer_bytes(socket: &UdpSocket) -> io::Result<usize> {
+    Ok(SockRef::from(socket).recv_buffer_size()? / 2)
 }
 
 fn bind(port: u16, shared: bool) -> io::Result<UdpSocket> {

@@ -27,6 +27,7 @@ use crate::rng::Rng;
 use crate::session::Sessions;
 use crate::streams::{StreamOut, Streams};
 
+mod beacon;
 mod handle;
 
 /// Membership datagrams that wait for a session with their destination.
@@ -141,6 +142,11 @@ pub struct HostStatus {
     pub rtt: Option<Duration>,
     /// Its boot clock minus this host's.
     pub clock: Option<ClockOffset>,
+    /// When its beacon last came here by multicast. They come each 4 to 4.5 s, unless it sends none.
+    pub beacon_heard: Option<Time>,
+    /// When it last said that this host's beacon came there by multicast. In a domain of more than a few it says so of a
+    /// share of them.
+    pub beacon_answered: Option<Time>,
 }
 
 impl Catalog {
@@ -180,8 +186,17 @@ impl Catalog {
         }
     }
 
-    /// Takes in a datagram from the control or the beacon socket. Bad ones are counted and dropped.
+    /// Takes in a datagram from the control socket. Bad ones are counted and dropped.
     pub fn handle_datagram(&mut self, from: SocketAddr, datagram: &mut [u8], now: Time) {
+        self.handle(from, datagram, false, now);
+    }
+
+    /// The same from the beacon socket, where what every host sends to all arrives by multicast.
+    pub fn handle_beacon(&mut self, from: SocketAddr, datagram: &mut [u8], now: Time) {
+        self.handle(from, datagram, true, now);
+    }
+
+    fn handle(&mut self, from: SocketAddr, datagram: &mut [u8], beacon: bool, now: Time) {
         self.now = now;
         self.counters.received += 1;
         self.counters.received_bytes += u64::try_from(datagram.len()).unwrap_or(u64::MAX);
@@ -192,7 +207,7 @@ impl Catalog {
             Err(refused) => Err(refused),
             Ok(header) if self.sessions.is_own(&header) => Err(Refused::Own),
             Ok(header) => match header.lane {
-                Lane::Hello => self.handle_greeting(from, datagram, now),
+                Lane::Hello => self.handle_greeting(from, datagram, beacon, now),
                 Lane::Control => self.handle_control(from, header.sender, datagram, now),
                 Lane::Commands | Lane::Values | Lane::Bulk => Err(Refused::Lane),
             },
@@ -405,6 +420,8 @@ impl Catalog {
                     rtt: used.and_then(|path| path.rtt).or(rtt),
                     paths,
                     clock: clock.and_then(|clock| clock.estimate(self.now)),
+                    beacon_heard: host.beacon_heard,
+                    beacon_answered: host.beacon_answered,
                 }
             })
             .collect()

@@ -60,6 +60,10 @@ pub(crate) struct Host {
     pub(crate) heard: Time,
     /// Since when it has held its prefix, on this host's clock, which may be before that began.
     pub(crate) prefix_since_ns: Option<i128>,
+    /// When its beacon last came here by multicast.
+    pub(crate) beacon_heard: Option<Time>,
+    /// When it last said that this host's came there.
+    pub(crate) beacon_answered: Option<Time>,
     doubted: Option<Time>,
     rumoured_down: bool,
     revived: Time,
@@ -94,6 +98,10 @@ pub(crate) struct Hosts {
 impl Hosts {
     pub(crate) fn get(&self, host: HostId) -> Option<&Host> {
         self.all.get(&host)
+    }
+
+    pub(crate) fn get_mut(&mut self, host: HostId) -> Option<&mut Host> {
+        self.all.get_mut(&host)
     }
 
     pub(crate) fn iter(&self) -> impl Iterator<Item = (HostId, &Host)> {
@@ -283,6 +291,8 @@ impl Host {
             since: now,
             heard: now,
             prefix_since_ns: None,
+            beacon_heard: None,
+            beacon_answered: None,
             doubted: None,
             rumoured_down: false,
             revived: Time(0),

@@ -50,6 +50,7 @@ pub(super) struct Network {
     outlets: Outlets,
     control_addrs: Vec<SocketAddr>,
     data_port: u16,
+    receive_buffer_bytes: usize,
     tx: Tx,
     tx_store: Store,
     rx: Rx,
@@ -107,6 +108,7 @@ impl Network {
         let outlets = Outlets::default();
         outlets.follow(&interfaces);
         let data_port = sockets.data.local_addr()?.port();
+        let receive_buffer_bytes = net::receive_buffer_bytes(&sockets.data)?;
         let seeds = config
             .join
             .iter()
@@ -170,6 +172,7 @@ impl Network {
             outlets,
             control_addrs,
             data_port,
+            receive_buffer_bytes,
             tx,
             tx_store,
             rx,
@@ -295,6 +298,11 @@ impl Network {
         self.data_port
     }
 
+    /// What the kernel granted to the socket of unicast samples, which may be less than was asked.
+    pub(super) fn receive_buffer_bytes(&self) -> usize {
+        self.receive_buffer_bytes
+    }
+
     pub(super) fn catalog(&self) -> &Catalog {
         &self.catalog
     }
@@ -327,13 +335,22 @@ impl Network {
             ..
         } = self;
         let mut buffer = [0; CONTROL_BUFFER_BYTES];
-        for socket in std::iter::once(&*control).chain(beacon.as_ref()) {
+        let sockets = [(Some(&*control), false), (beacon.as_ref(), true)];
+        for (socket, is_beacon) in sockets
+            .into_iter()
+            .filter_map(|(socket, is_beacon)| Some((socket?, is_beacon)))
+        {
             for _turn in 0..DATAGRAMS_PER_TURN {
                 match socket.try_recv_from(&mut buffer) {
                     Ok((len, from)) => {
                         count(&control_traffic.received_datagrams, 1);
                         count(&control_traffic.received_bytes, len);
-                        if let Some(datagram) = buffer.get_mut(..len) {
+                        let Some(datagram) = buffer.get_mut(..len) else {
+                            continue;
+                        };
+                        if is_beacon {
+                            catalog.handle_beacon(from, datagram, ddx_store::now());
+                        } else {
                             catalog.handle_datagram(from, datagram, ddx_store::now());
                         }
                     }

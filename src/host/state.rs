@@ -2,8 +2,8 @@
 //!
 //! | item | what it holds |
 //! |---|---|
-//! | `@/self` | this host: name, id, domain, whether there is a key, addresses, ports |
-//! | `@/hosts` | the other hosts: name, id, state, address in use, round trip, loss, all paths, since when |
+//! | `@/self` | this host: name, id, domain, whether there is a key, addresses, ports, what the system granted |
+//! | `@/hosts` | the other hosts: name, id, state, address in use, round trip, loss, all paths, since when; when multicast last passed from and to each |
 //! | `@/routes` | streams out and in: item, peers, path, group, rate |
 //! | `@/clock` | offset and bound of each other host's clock, nanoseconds |
 //! | `@/counters` | name to count: datagrams, bytes, drops by reason |
@@ -19,10 +19,11 @@ use ddx_store::server::Handle;
 use ddx_store::{RawWriter, Schema, Store, WriterOptions};
 use ddx_wire::seal::Refused;
 use ddx_wire::{ItemName, Tag};
+use rustix::process::{Resource, getrlimit};
 use serde_json::{Map, Value, json};
 
-use super::Ready;
 use super::network::Network;
+use super::{Config, Ready};
 use crate::data::Traffic;
 use crate::identity::Identity;
 
@@ -46,7 +47,13 @@ struct Item {
 }
 
 impl Publisher {
-    pub(super) fn new(handle: &Handle, identity: Identity, ready: &Ready) -> anyhow::Result<Self> {
+    pub(super) fn new(
+        handle: &Handle,
+        identity: Identity,
+        ready: &Ready,
+        config: &Config,
+        network: Option<&Network>,
+    ) -> anyhow::Result<Self> {
         let store = handle
             .connect()
             .context("connecting the daemon's own state to the store")?;
@@ -59,6 +66,10 @@ impl Publisher {
             "socket": ready.socket,
             "control": ready.control,
             "data_port": ready.data_port,
+            "beacon": config.beacon,
+            "receive_buffer_bytes": network.map(Network::receive_buffer_bytes),
+            "pid": std::process::id(),
+            "files_max": getrlimit(Resource::Nofile).current,
             "version": env!("CARGO_PKG_VERSION"),
         });
         Ok(Self {
@@ -155,6 +166,8 @@ fn host(status: &HostStatus) -> Value {
         "loss_percent": used(status).map(loss_percent),
         "paths": status.paths.iter().map(path_to).collect::<Vec<_>>(),
         "since": status.since.0,
+        "multicast_in": status.beacon_heard.map(|at| at.0),
+        "multicast_out": status.beacon_answered.map(|at| at.0),
     })
 }
 

@@ -22,9 +22,19 @@ impl Catalog {
         &mut self,
         from: SocketAddr,
         datagram: &mut [u8],
+        beacon: bool,
         now: Time,
     ) -> Result<(), Refused> {
         let greeting = self.sessions.open_greeting(datagram)?;
+        // Seeds are greeted at the same port by unicast, and say so.
+        if let Greeting::Hello {
+            from,
+            directed: false,
+        } = &greeting
+            && beacon
+        {
+            self.note_beacon(Tag::of(from.host, from.incarnation), now);
+        }
         let host = match &greeting {
             Greeting::Hello { from, .. }
             | Greeting::Challenge { from, .. }
@@ -217,6 +227,11 @@ impl Catalog {
                 }
                 let news = (revision, control_addrs.as_slice());
                 self.sessions.paths.announced(tag, from, news, now, out);
+            }
+            Message::BeaconHeard => {
+                if let Some(host) = self.hosts.get_mut(host) {
+                    host.beacon_answered = Some(now);
+                }
             }
             Message::Leave => {
                 self.hosts.left(host, now, &mut self.out);

@@ -168,6 +168,8 @@ pub enum Message {
         /// All of them, at most four.
         control_addrs: Vec<SocketAddr>,
     },
+    /// Your beacon came here by multicast.
+    BeaconHeard,
 }
 
 /// How far one life of a host is known.
@@ -388,6 +390,9 @@ mod tests {
         bytes.clear();
         codec::encode(&addresses, &mut bytes).unwrap();
         assert_eq!(bytes, [17, 3, 1, 0, 10, 0, 0, 1, 7]);
+        bytes.clear();
+        codec::encode(&Message::BeaconHeard, &mut bytes).unwrap();
+        assert_eq!(bytes, [18]);
         let renewed = Message::Renewed {
             echo: Time(1),
             at: Time(2),
