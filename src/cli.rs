@@ -1,6 +1,7 @@
 //! The command line: what can be typed, as data, and the one place that exits. One file for each verb.
 
 mod demo;
+mod doctor;
 mod get;
 mod host;
 mod hz;
@@ -86,6 +87,8 @@ enum Verb {
     Info(info::Args),
     /// Say in one sentence why a reader gets nothing
     Why(why::Args),
+    /// Check this host, and say what to do (multicast)
+    Doctor(doctor::Args),
     /// List the hosts of the domain (ls)
     #[command(subcommand)]
     Host(host::Verb),
@@ -165,6 +168,7 @@ fn run(cli: Cli) -> Outcome {
         Verb::Hz(args) => hz::run(context, &args),
         Verb::Info(args) => info::run(context, &args),
         Verb::Why(args) => why::run(context, &args),
+        Verb::Doctor(args) => doctor::run(context, &args),
         Verb::Host(verb) => host::run(context, &verb),
         Verb::Key(verb) => key::run(context, &verb),
         Verb::Source(verb) => source::run(context, &verb),

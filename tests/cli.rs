@@ -227,6 +227,49 @@ fn what_is_put_can_be_got_listed_explained_and_removed() {
 }
 
 #[test]
+fn the_doctor_is_content_with_a_daemon_and_says_how_to_get_one() {
+    let mut daemon = Daemon::start(&[]);
+    let socket = daemon.socket();
+
+    let checked = daemon.ddx(&["doctor"]);
+    let said = text(&checked.stdout);
+    assert_eq!(code(&checked), 0, "{said}");
+    let pid = daemon.child.id();
+    assert!(
+        said.lines().next().unwrap().ends_with(&format!(
+            " with pid {pid} serves host robot1 in domain 0 at {}",
+            socket.display()
+        )),
+        "{said}"
+    );
+    assert!(said.ends_with("\nall is well\n"), "{said}");
+    let alone = daemon.ddx(&["doctor", "multicast"]);
+    assert_eq!(code(&alone), 1);
+    assert!(
+        text(&alone.stderr).contains("hint: `ddx key new > FILE`"),
+        "{}",
+        text(&alone.stderr)
+    );
+
+    daemon.child.kill().unwrap();
+    daemon.child.wait().unwrap();
+    let checked = daemon.ddx(&["--json", "doctor"]);
+    assert_eq!(code(&checked), 1);
+    let found: Vec<Value> = text(&checked.stdout)
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(
+        (&found[0]["level"], &found[0]["hint"]),
+        (&json!("fail"), &json!("start one with `ddx up`"))
+    );
+    assert!(
+        found.iter().any(|found| found["check"] == "memory"),
+        "what needs no daemon is checked: {found:?}"
+    );
+}
+
+#[test]
 fn why_tells_a_missing_name_from_a_missing_key() {
     let daemon = Daemon::start(&[]);
     daemon.json(&["put", "speed", "1", "--type", "u64"]);

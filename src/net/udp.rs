@@ -84,6 +84,11 @@ impl Channel {
         self.state.max_gso_segments()
     }
 
+    /// Most datagrams that one receive may bring in one run.
+    pub(crate) fn max_received_segments(&self) -> usize {
+        self.state.gro_segments()
+    }
+
     /// Takes what has arrived, without waiting, and hands over datagram after datagram.
     pub(crate) fn receive(
         &mut self,

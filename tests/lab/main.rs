@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `interest.rs` | nothing is sent until somebody reads, then once, and no longer than somebody reads |
 //! | `hosts.rs` | hosts join, leave, die, are cut off, and come back; a host without a network is whole |
+//! | `doctor.rs` | `ddx doctor` tells by direction where multicast does not pass |
 //! | `load.rs` | the books balance under load, and the last value arrives under loss |
 //! | `paths.rs` | samples flow on when interfaces come, go and change address |
 //! | `why.rs` | `ddx why` names the cause |
@@ -14,6 +15,7 @@
     reason = "a helper of a test fails the test, as the test itself would"
 )]
 
+mod doctor;
 mod hosts;
 mod interest;
 mod load;
