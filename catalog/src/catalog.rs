@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::message::Message;
+use ddx_wire::message::{Message, NackEntry, ReportEntry};
 use ddx_wire::seal::{Header, Lane, Refused};
 use ddx_wire::{
     ClockOffset, Contract, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName,
@@ -333,6 +333,18 @@ impl Catalog {
     pub fn heard_on_group(&mut self, tag: Tag, stream: StreamId, now: Time) {
         self.now = now;
         self.interest.heard_on_group(tag, stream, now);
+    }
+
+    /// Tells a sender how its datagrams arrive.
+    pub fn report(&mut self, tag: Tag, report: ReportEntry, now: Time) {
+        self.now = now;
+        self.out.send(tag, &Message::Report(vec![report]));
+    }
+
+    /// Asks a sender for what is missing.
+    pub fn nack(&mut self, tag: Tag, nack: NackEntry, now: Time) {
+        self.now = now;
+        self.out.send(tag, &Message::Nack(vec![nack]));
     }
 
     /// Says goodbye to all. What [`Catalog::poll_transmit`] yields afterwards is the last of it.

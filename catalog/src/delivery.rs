@@ -1,25 +1,45 @@
 //! Carrying samples between hosts: what the sending and the receiving thread decide, without a socket or a clock.
 //!
-//! A [`Sender`] coalesces small samples into datagrams, cuts large ones into fragments, limits rates at the source and
-//! repeats the last value to a host that does not confirm it. A [`Receiver`] opens, reassembles, orders, deduplicates and
-//! keeps the books of each stream. Both are driven alike: one mutation, then drain `poll_transmit` or `poll_sample`, then
-//! `poll_event`, then sleep until `poll_timeout`. The wire format is in `catalog/PROTOCOL.md`.
+//! A [`Sender`] coalesces small samples into datagrams, cuts large ones into fragments, keeps contracts at the source and
+//! each path below the rate at which it fills, and repeats what a host lacks. A [`Receiver`] opens, reassembles, orders,
+//! deduplicates and keeps the books of each stream. Both are driven alike: one mutation, then drain `poll_event`,
+//! `poll_transmit` or `poll_sample`, then sleep until `poll_timeout`. The wire format is in `catalog/PROTOCOL.md`.
+//!
+//! Next to nothing is queued: the store keeps the samples, and a path that has room asks for the one that it needs next.
+//!
+//! ```text
+//! sender      streams, readers, repeats of the last value
+//! path        one destination: rate, lanes, turns        receiver    streams, sessions
+//! congestion  the rate, from reports                     reception   reports
+//! flow        one stream on one path                     order       each sample, in order
+//! transfer    one large sample in fragments              reassembly  fragments, and what is missing
+//! queue       datagrams that are about to leave          books       what became of each sample
+//! ```
 
 use std::net::SocketAddr;
+use std::time::Duration;
 
+use ddx_wire::message::{NackEntry, ReportEntry};
 pub use ddx_wire::sample::SampleMeta;
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 mod books;
+mod congestion;
 mod deadlines;
 mod early;
-mod outbox;
+mod flow;
+mod order;
 mod pace;
+mod path;
+mod queue;
 mod reassembly;
 mod receiver;
+mod reception;
 mod sender;
+mod transfer;
 
 pub use books::Books;
+pub(crate) use congestion::Progress;
 pub use receiver::{Receiver, ReceiverConfig, ReceiverCounters};
 pub use sender::{Sender, SenderConfig, SenderCounters, StreamCounters};
 
@@ -28,10 +48,8 @@ pub use sender::{Sender, SenderConfig, SenderCounters, StreamCounters};
 pub struct Route {
     /// Union of what the readers ask.
     pub contract: Contract,
-    /// The hosts that read the stream. Those beyond 1,024 are left out.
+    /// The hosts that read the stream, and which way each is served. Those beyond 1,024 are left out.
     pub readers: Vec<ReaderHost>,
-    /// By which way.
-    pub path: Path,
 }
 
 /// A host that reads a stream.
@@ -41,17 +59,60 @@ pub struct ReaderHost {
     pub tag: Tag,
     /// Its data port.
     pub addr: SocketAddr,
+    /// Which way it is served.
+    pub via: Via,
 }
 
-/// The way that a stream takes.
+/// The way of a stream to one reading host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Path {
-    /// One copy for each reading host.
+pub enum Via {
+    /// A copy of its own.
     Unicast,
-    /// One copy to this group for all.
-    Multicast(SocketAddr),
-    /// Both, until every reader confirms the group; readers drop the second copy.
+    /// One copy to this group, for all that take this way.
+    Group(SocketAddr),
+    /// Both, until the reader confirms the group; it drops the second copy.
     Both(SocketAddr),
+}
+
+/// What a [`Sender`] wants read from the store.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fetch {
+    /// The stream.
+    pub stream: StreamId,
+    /// The destination that has room for it.
+    pub to: SocketAddr,
+    /// Which sample.
+    pub want: Want,
+    /// Whether it was sent before.
+    pub again: bool,
+}
+
+/// Which sample of an item is wanted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Want {
+    /// The newest.
+    Newest,
+    /// The oldest that is still there and newer than this one.
+    After(Epoch, Seq),
+    /// This one, or the oldest after it that is still there.
+    At(Epoch, Seq),
+}
+
+/// What is known of a destination, for listings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PathStatus {
+    /// The destination.
+    pub to: SocketAddr,
+    /// Rate that it is believed to carry.
+    pub bytes_per_second: u64,
+    /// How much longer datagrams take than the fastest of late.
+    pub queue: Duration,
+    /// Share of datagrams lost at the last report, thousandths.
+    pub loss_permille: u16,
+    /// Longest datagram that is known to get through, bytes.
+    pub datagram_bytes: usize,
+    /// Streams that wait for their turn.
+    pub waiting: usize,
 }
 
 /// When a stream's contract admits its next sample.
@@ -75,17 +136,12 @@ pub struct Transmit {
 /// What a [`Sender`] asks of its driver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SenderEvent {
-    /// Pass the stream's present value, if it has one, to [`Sender::repeat`].
-    Repeat {
-        /// The stream.
-        stream: StreamId,
-        /// The host that lacks it.
-        to: Tag,
-    },
+    /// Read this from the store, and pass it to [`Sender::fetched`].
+    Fetch(Fetch),
 }
 
 /// What a [`Receiver`] tells its driver.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ReceiverEvent {
     /// Tell the sender what is held: the stream went quiet, or a repeat came.
     Quiet {
@@ -116,6 +172,10 @@ pub enum ReceiverEvent {
         /// The stream.
         stream: StreamId,
     },
+    /// Tell the sender how its datagrams arrive.
+    Report(Tag, ReportEntry),
+    /// Tell the sender what is missing.
+    Nack(Tag, NackEntry),
 }
 
 /// A sample that arrived whole, newer than any delivered before it on its stream.
@@ -134,16 +194,67 @@ pub struct Received<'a> {
 /// Why a machine wants to be called again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TimerName {
-    /// A datagram has waited for company long enough.
-    Coalesce,
-    /// The paced rate admits the next batch.
+    /// The rate of a path admits its next batch.
     Pace,
     /// A reader has not confirmed the last value.
     Repeat,
     /// A stream may have gone quiet.
     Quiet,
-    /// An incomplete sample is given up.
+    /// Fragments are asked for, or an incomplete sample is given up.
     Reassembly,
+    /// Samples are asked for, or given up.
+    Order,
+    /// A sender is told how its datagrams arrive.
+    Report,
+}
+
+impl Via {
+    /// The group, if it is used.
+    pub fn group(self) -> Option<SocketAddr> {
+        match self {
+            Self::Unicast => None,
+            Self::Group(group) | Self::Both(group) => Some(group),
+        }
+    }
+}
+
+impl Route {
+    /// Whether one copy to a group serves all.
+    pub fn is_by_group(&self) -> bool {
+        let mut vias = self.readers.iter().map(|reader| reader.via);
+        !self.readers.is_empty() && vias.all(|via| matches!(via, Via::Group(_)))
+    }
+
+    /// Whether each reader gets a copy of its own, and no group any.
+    pub fn is_by_unicast(&self) -> bool {
+        let mut vias = self.readers.iter().map(|reader| reader.via);
+        vias.all(|via| via == Via::Unicast)
+    }
+}
+
+impl ReaderHost {
+    /// Where samples go for it.
+    fn destinations(&self) -> impl Iterator<Item = SocketAddr> {
+        let unicast = match self.via {
+            Via::Unicast | Via::Both(_) => Some(self.addr),
+            Via::Group(_) => None,
+        };
+        unicast.into_iter().chain(self.via.group())
+    }
+
+    /// Whether what goes to `to` is meant for it too.
+    fn is_reached_by(&self, to: SocketAddr) -> bool {
+        self.addr == to || self.destinations().any(|destination| destination == to)
+    }
+}
+
+/// The number of a group's path, from 1; `None` for an address of one host. Every host of a domain numbers them alike.
+pub(crate) fn group_number(to: SocketAddr) -> Option<u16> {
+    let SocketAddr::V4(to) = to else {
+        return None;
+    };
+    let last = to.ip().octets()[3];
+    to.ip().is_multicast().then_some(u16::from(last % 16) + 1)
 }
 
 /// Order of samples within a stream: by epoch, then by number.

@@ -3,10 +3,11 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::Opener;
 use ddx_wire::{
-    ClockOffset, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName, Seq, StreamId,
-    Tag,
+    ClockOffset, Contract, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName, Seq,
+    StreamId, Tag,
 };
 
 use crate::delivery::Route;
@@ -119,6 +120,20 @@ pub enum Event {
         /// Sequence of the newest sample that it holds.
         seq: Seq,
     },
+    /// A reading host tells how datagrams reach it.
+    Report {
+        /// The reading host.
+        tag: Tag,
+        /// What it says of one path.
+        report: ReportEntry,
+    },
+    /// A reading host lacks something.
+    Nack {
+        /// The reading host.
+        tag: Tag,
+        /// What it lacks.
+        nack: NackEntry,
+    },
     /// Samples of an item that this host subscribed to will arrive on a stream.
     Expect {
         /// The sending host.
@@ -129,6 +144,8 @@ pub enum Event {
         name: ItemName,
         /// What its owner says about it.
         description: ItemDescription,
+        /// What was asked for.
+        contract: Contract,
     },
     /// A stream is over.
     Forget {

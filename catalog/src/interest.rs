@@ -242,7 +242,7 @@ impl Interest {
             let Some(own_name) = want.phase.name() else {
                 continue;
             };
-            let name = name.clone();
+            let (name, contract) = (name.clone(), want.contract);
             let granted = Phase::Granted {
                 owner: from,
                 name: own_name,
@@ -273,6 +273,7 @@ impl Interest {
                     stream,
                     name,
                     description,
+                    contract,
                 });
             }
             let soon = if entry.group.is_some() {

@@ -1,20 +1,25 @@
 //! What others want of this host: leases, the streams that serve them, and the path of each stream.
 //!
 //! One stream serves all readers of one item under one contract. One reading host gets unicast. Two or more are offered a
-//! group, are sent both until each confirms that samples arrive there, and then the group alone; when one does not confirm
-//! although samples flow, all stay on unicast for a while.
+//! group; each is sent both until it confirms that samples arrive there, and then the group alone. Whoever does not
+//! confirm although samples flow, or loses more by the group than by unicast, is served by unicast for a while.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::message::{AckEntry, GrantEntry, Message, Reception, RenewEntry, SubscribeEntry};
+use ddx_wire::message::{
+    AckEntry, GrantEntry, Message, Reception, RenewEntry, ReportEntry, SubscribeEntry,
+};
 use ddx_wire::{Contract, DomainId, ItemName, StreamId, Tag, Time};
 
 use crate::config::{SAMPLE_GROUPS, sample_group};
-use crate::delivery::{Path, ReaderHost, Route};
+use crate::delivery::{ReaderHost, Route, Via, group_number};
 use crate::event::Event;
 use crate::outbox::Outbox;
+use crate::streams::quality::Quality;
+
+mod quality;
 
 const LEASE: Duration = Duration::from_secs(3);
 const TICK: Duration = Duration::from_millis(250);
@@ -33,6 +38,7 @@ pub(crate) struct Streams {
     leases: BTreeMap<(Tag, u32), Lease>,
     streams: BTreeMap<StreamId, Stream>,
     by_item: BTreeMap<(ItemName, Contract), StreamId>,
+    quality: BTreeMap<Tag, Quality>,
     last: u32,
     next_tick: Option<Time>,
 }
@@ -52,6 +58,10 @@ struct Lease {
     closed: bool,
     group: Option<SocketAddr>,
     reception: Reception,
+    /// The group is not tried before: it was silent.
+    unicast_until: Time,
+    /// Since when it is served as it is.
+    since: Time,
 }
 
 struct Stream {
@@ -59,11 +69,10 @@ struct Stream {
     contract: Contract,
     readers: BTreeMap<Tag, u32>,
     route: Option<Route>,
-    unicast_until: Time,
 }
 
 /// A stream that this host sends, for listings.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StreamOut {
     /// Its number.
     pub stream: StreamId,
@@ -71,6 +80,21 @@ pub struct StreamOut {
     pub name: ItemName,
     /// To whom, how often and by what path.
     pub route: Route,
+    /// Why each reader is served as it is, in the order of the route.
+    pub choices: Vec<Choice>,
+}
+
+/// The figures behind the way of a stream to one reading host.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Choice {
+    /// Since when it is served so.
+    pub since: Time,
+    /// Share of datagrams lost by unicast, 0 where nothing is known.
+    pub unicast_loss: f64,
+    /// Share of datagrams lost by the item's group, if any came or should have.
+    pub group_loss: Option<f64>,
+    /// Whether the group is not used because it does not work.
+    pub shuns_group: bool,
 }
 
 impl Streams {
@@ -81,6 +105,7 @@ impl Streams {
             leases: BTreeMap::new(),
             streams: BTreeMap::new(),
             by_item: BTreeMap::new(),
+            quality: BTreeMap::new(),
             last: 0,
             next_tick: None,
         }
@@ -135,6 +160,8 @@ impl Streams {
                 closed: false,
                 group: None,
                 reception: Reception::Unknown,
+                unicast_until: now,
+                since: now,
             };
             self.leases.insert(key, lease);
             if let Some(stream) = self.streams.get_mut(&id)
@@ -256,31 +283,53 @@ impl Streams {
         }
     }
 
+    /// Takes in how datagrams reach a host: a group that does not work is given up for it.
+    pub(crate) fn handle_report(
+        &mut self,
+        from: Tag,
+        reports: &[ReportEntry],
+        now: Time,
+        out: &mut Outbox,
+    ) {
+        if !self.serves(from) {
+            return;
+        }
+        let quality = self.quality.entry(from).or_default();
+        let mut turned = false;
+        for report in reports {
+            turned |= quality.handle_report(report, now);
+        }
+        if turned {
+            let leases = self.leases.range((from, 0)..=(from, u32::MAX));
+            let streams: Vec<_> = leases.map(|(_, lease)| lease.stream).collect();
+            for stream in streams {
+                self.route(stream, now, out);
+            }
+        }
+    }
+
     /// Sends what a host reads to another address of it from now on.
     ///
-    /// Its group may not reach it there: what it shares with others goes to all by unicast for a moment, until a new
-    /// trial has shown that the group does.
+    /// Its group may not reach it there: it is served by unicast for a moment, until a new trial has shown that the group
+    /// does.
     pub(crate) fn moved(&mut self, reader: Tag, at: ReaderAddr, now: Time, out: &mut Outbox) {
         let leases = self.leases.range_mut((reader, 0)..=(reader, u32::MAX));
         let mut streams = Vec::new();
         for (_, lease) in leases.filter(|(_, lease)| lease.at.data != at.data) {
             lease.at = at;
+            lease.unicast_until = lease.unicast_until.max(now + MOVED_PAUSE);
             if !lease.closed {
                 streams.push(lease.stream);
             }
         }
         for id in streams {
-            if let Some(stream) = self.streams.get_mut(&id)
-                && stream.readers.len() > 1
-            {
-                stream.unicast_until = stream.unicast_until.max(now + MOVED_PAUSE);
-            }
             self.route(id, now, out);
         }
     }
 
     /// Forgets what a host wanted.
     pub(crate) fn drop_reader(&mut self, reader: Tag, now: Time, out: &mut Outbox) {
+        self.quality.remove(&reader);
         let leases = self.leases.range((reader, 0)..=(reader, u32::MAX));
         let leases: Vec<_> = leases
             .map(|((_, want), lease)| (*want, lease.stream))
@@ -316,10 +365,16 @@ impl Streams {
 
     pub(crate) fn iter(&self) -> impl Iterator<Item = StreamOut> {
         self.streams.iter().filter_map(|(id, stream)| {
+            let route = stream.route.clone()?;
+            let choices = route
+                .readers
+                .iter()
+                .map(|reader| self.choice(stream, reader));
             Some(StreamOut {
                 stream: *id,
                 name: stream.name.clone(),
-                route: stream.route.clone()?,
+                choices: choices.collect(),
+                route,
             })
         })
     }
@@ -370,7 +425,6 @@ impl Streams {
             contract,
             readers: BTreeMap::new(),
             route: None,
-            unicast_until: Time(0),
         };
         self.streams.insert(id, stream);
         id
@@ -400,38 +454,55 @@ impl Streams {
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
-        let leases = stream.readers.iter();
-        let leases = leases.filter_map(|(tag, want)| self.leases.get(&(*tag, *want)));
-        let capable = leases.clone().all(|lease| lease.at.multicast);
-        let all_arrive = leases
-            .clone()
-            .all(|lease| lease.reception == Reception::Arrives);
-        if leases
-            .clone()
-            .any(|lease| lease.reception == Reception::Silent)
-        {
-            stream.unicast_until = now + TRIAL_PAUSE;
+        let group = sample_group(self.domain, group_index(&stream.name));
+        let mut members = BTreeMap::new();
+        for (tag, want) in &stream.readers {
+            let Some(lease) = self.leases.get_mut(&(*tag, *want)) else {
+                continue;
+            };
+            if lease.reception == Reception::Silent {
+                lease.unicast_until = now + TRIAL_PAUSE;
+            }
+            let works = self.quality.get(tag).zip(group_number(group));
+            let works = works.is_none_or(|(quality, number)| quality.admits(number, now));
+            let tried = self.multicast && lease.at.multicast && now >= lease.unicast_until && works;
+            members.insert(*tag, tried);
         }
-        let tried =
-            self.multicast && capable && stream.readers.len() >= 2 && now >= stream.unicast_until;
-        let group = tried.then(|| sample_group(self.domain, group_index(&stream.name)));
-        let path = match group {
-            None => Path::Unicast,
-            Some(group) if all_arrive => Path::Multicast(group),
-            Some(group) => Path::Both(group),
+        if members.values().filter(|tried| **tried).count() < 2 {
+            members.values_mut().for_each(|tried| *tried = false);
+        }
+        let mut route = Route {
+            contract: stream.contract,
+            readers: Vec::new(),
         };
-        let readers = stream.readers.iter().filter_map(|(tag, want)| {
-            let lease = self.leases.get(&(*tag, *want))?;
-            Some(ReaderHost {
+        for (tag, want) in &stream.readers {
+            let Some(lease) = self.leases.get_mut(&(*tag, *want)) else {
+                continue;
+            };
+            let offered = members
+                .get(tag)
+                .is_some_and(|tried| *tried)
+                .then_some(group);
+            if lease.group != offered {
+                lease.group = offered;
+                (lease.reception, lease.since) = (Reception::Unknown, now);
+                let grant = GrantEntry {
+                    want: *want,
+                    stream: Some(id),
+                    group: offered,
+                };
+                out.send(*tag, &Message::Grant(vec![grant]));
+            }
+            route.readers.push(ReaderHost {
                 tag: *tag,
                 addr: lease.at.data,
-            })
-        });
-        let route = Route {
-            contract: stream.contract,
-            readers: readers.collect(),
-            path,
-        };
+                via: match offered {
+                    None => Via::Unicast,
+                    Some(group) if lease.reception == Reception::Arrives => Via::Group(group),
+                    Some(group) => Via::Both(group),
+                },
+            });
+        }
         if stream.route.as_ref() != Some(&route) {
             let first = stream.route.is_none();
             stream.route = Some(route.clone());
@@ -445,22 +516,20 @@ impl Streams {
                 Event::UpdateStream { stream: id, route }
             });
         }
-        for (tag, want) in &stream.readers {
-            if let Some(lease) = self.leases.get_mut(&(*tag, *want))
-                && lease.group != group
-            {
-                lease.group = group;
-                lease.reception = Reception::Unknown;
-                let stream = Some(id);
-                out.send(
-                    *tag,
-                    &Message::Grant(vec![GrantEntry {
-                        want: *want,
-                        stream,
-                        group,
-                    }]),
-                );
-            }
+    }
+
+    fn choice(&self, stream: &Stream, reader: &ReaderHost) -> Choice {
+        let lease = stream.readers.get(&reader.tag);
+        let lease = lease.and_then(|want| self.leases.get(&(reader.tag, *want)));
+        let quality = self.quality.get(&reader.tag);
+        let number = group_number(sample_group(self.domain, group_index(&stream.name)));
+        Choice {
+            since: lease.map_or(Time(0), |lease| lease.since),
+            unicast_loss: quality.map_or(0.0, Quality::unicast_loss),
+            group_loss: quality
+                .zip(number)
+                .and_then(|(q, number)| q.group_loss(number)),
+            shuns_group: quality.is_some_and(Quality::shuns),
         }
     }
 }
@@ -519,23 +588,34 @@ mod tests {
             .len()
     }
 
-    fn path(streams: &Streams) -> Option<Path> {
-        streams.iter().next().map(|stream| stream.route.path)
+    fn path(streams: &Streams) -> Vec<&'static str> {
+        let stream = streams.iter().next();
+        let readers = stream.into_iter().flat_map(|stream| stream.route.readers);
+        readers
+            .map(|reader| match reader.via {
+                Via::Unicast => "unicast",
+                Via::Group(_) => "group",
+                Via::Both(_) => "both",
+            })
+            .collect()
     }
 
     #[test]
     fn the_path_follows_what_readers_report() {
         let (mut streams, mut out) = (Streams::new(DomainId(1), true), Outbox::default());
         reader(&mut streams, 1, 1, NOW, &mut out);
-        assert_eq!(path(&streams), Some(Path::Unicast));
+        assert_eq!(path(&streams), ["unicast"]);
         reader(&mut streams, 2, 1, NOW, &mut out);
-        assert!(matches!(path(&streams), Some(Path::Both(_))));
+        assert_eq!(path(&streams), ["both", "both"]);
         renew(&mut streams, 1, 1, Reception::Arrives, NOW);
-        assert!(matches!(path(&streams), Some(Path::Both(_))));
+        assert_eq!(path(&streams), ["group", "both"]);
         renew(&mut streams, 2, 1, Reception::Arrives, NOW);
-        assert!(matches!(path(&streams), Some(Path::Multicast(_))));
+        assert_eq!(path(&streams), ["group", "group"]);
         renew(&mut streams, 2, 1, Reception::Silent, NOW);
-        assert_eq!(path(&streams), Some(Path::Unicast));
+        assert_eq!(path(&streams), ["unicast", "unicast"]);
+        // With a third, the deaf one alone stays on unicast.
+        reader(&mut streams, 3, 1, NOW, &mut out);
+        assert_eq!(path(&streams), ["both", "unicast", "both"]);
     }
 
     #[test]
@@ -543,16 +623,16 @@ mod tests {
         let (mut streams, mut out) = (Streams::new(DomainId(1), true), Outbox::default());
         reader(&mut streams, 1, 5, NOW, &mut out);
         streams.handle_unsubscribe(Tag(1), &[5], NOW, &mut out);
-        assert_eq!(path(&streams), None);
+        assert!(path(&streams).is_empty());
         reader(&mut streams, 1, 5, NOW, &mut out);
-        assert_eq!(path(&streams), None);
+        assert!(path(&streams).is_empty());
         assert_eq!(
             renew(&mut streams, 1, 5, Reception::Unknown, NOW),
             1,
             "unknown"
         );
         reader(&mut streams, 1, 6, NOW, &mut out);
-        assert_eq!(path(&streams), Some(Path::Unicast));
+        assert_eq!(path(&streams), ["unicast"]);
     }
 
     #[test]
@@ -570,9 +650,9 @@ mod tests {
         }
 
         assert!(lapses.since(last) <= TICK, "it was looked at to the last");
-        assert_eq!(path(&streams), Some(Path::Unicast));
+        assert_eq!(path(&streams), ["unicast"]);
         assert_eq!(streams.poll_timeout(), Some(lapses));
         streams.handle_timeout(lapses, &mut out);
-        assert_eq!(path(&streams), None);
+        assert!(path(&streams).is_empty());
     }
 }

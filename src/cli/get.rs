@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use ddx_store::ReaderOptions;
+
 use super::subscription::Subscription;
 use super::{Context, render, why};
 use crate::error::{Exit, Failure, Outcome};
@@ -20,7 +22,7 @@ pub(crate) struct Args {
 /// Runs the verb.
 pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
     let store = context.store("get")?;
-    let mut subscription = Subscription::open(&store, &args.name, None)?;
+    let mut subscription = Subscription::open(&store, &args.name, ReaderOptions::default())?;
     if let Some(seen) = subscription.first(args.timeout)? {
         let now = ddx_store::now();
         let text = format!(

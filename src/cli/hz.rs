@@ -4,6 +4,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
+use ddx_store::ReaderOptions;
+
 use super::Context;
 use super::render::{rate, span};
 use super::subscription::Subscription;
@@ -28,7 +30,7 @@ struct Intervals {
 /// Runs the verb. Without `--count` it ends when it is interrupted.
 pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
     let store = context.store("hz")?;
-    let mut subscription = Subscription::open(&store, &args.name, None)?;
+    let mut subscription = Subscription::open(&store, &args.name, ReaderOptions::default())?;
     let mut reports = 0;
     let mut last = None;
     let mut seen_any = false;

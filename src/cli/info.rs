@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::Context;
 use super::ls::{elapsed_ns, object, writer};
-use super::render::{Table, bytes, rate, span};
+use super::render::{Table, bytes, span};
 use crate::error::{Exit, Hint as _, Outcome};
 
 /// Which item.
@@ -74,13 +74,13 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
     if item.readers.is_empty() {
         lines.push("readers   none on this host".to_owned());
     } else {
-        let mut table = Table::new(&["readers ", "PROGRAM", "PID", "AT MOST", "STATE"]);
+        let mut table = Table::new(&["readers ", "PROGRAM", "PID", "CONTRACT", "STATE"]);
         for reader in &item.readers {
             table.row(vec![
                 String::new(),
                 reader.program.clone(),
                 reader.pid.to_string(),
-                limit(reader),
+                reader.contract.to_string(),
                 state(reader),
             ]);
         }
@@ -89,13 +89,6 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
     lines.push(String::new());
     lines.extend(item.schema.lines().map(str::to_owned));
     lines
-}
-
-fn limit(reader: &ReaderEntry) -> String {
-    reader.rate_mhz.map_or_else(
-        || "every sample".to_owned(),
-        |mhz| rate(Some(f64::from(mhz) / 1e3)),
-    )
 }
 
 fn state(reader: &ReaderEntry) -> String {
@@ -110,7 +103,7 @@ fn reader_object(reader: &ReaderEntry) -> Value {
     json!({
         "program": reader.program,
         "pid": reader.pid,
-        "rate_mhz": reader.rate_mhz,
+        "contract": reader.contract.to_string(),
         "bound": reader.bound,
         "refused": reader.refused,
     })

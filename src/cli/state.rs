@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use ddx_store::Store;
+use ddx_store::{ReaderOptions, Store};
 use serde::Deserialize;
 use serde_json::Value;
 
@@ -46,7 +46,7 @@ pub(crate) struct Own {
 
 /// Reads one of the daemon's items; `None` when it is not there within a moment.
 pub(crate) fn read(store: &Store, name: &str) -> anyhow::Result<Option<Value>> {
-    let mut subscription = Subscription::open(store, name, None)?;
+    let mut subscription = Subscription::open(store, name, ReaderOptions::default())?;
     let seen = subscription.first(PATIENCE)?;
     Ok(seen.map(|seen| seen.value.clone()))
 }

@@ -33,12 +33,8 @@ pub(crate) struct Tally {
 }
 
 impl Subscription {
-    /// Opens a reader on `name`, with at most `rate` samples a second.
-    pub(crate) fn open(store: &Store, name: &str, rate: Option<f64>) -> anyhow::Result<Self> {
-        let options = ReaderOptions {
-            rate,
-            ..ReaderOptions::default()
-        };
+    /// Opens a reader on `name`.
+    pub(crate) fn open(store: &Store, name: &str, options: ReaderOptions) -> anyhow::Result<Self> {
         Ok(Self {
             reader: store.raw_reader(name, None, options)?,
             payload: Vec::new(),

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use ddx_store::{Store, Wait, wait_any};
-use ddx_wire::Pattern;
+use ddx_store::{ReaderOptions, Store, Wait, wait_any};
+use ddx_wire::{Delivery, Pattern, Priority};
 
 use super::render::{self, Table};
 use super::subscription::Subscription;
@@ -21,6 +21,15 @@ pub(crate) struct Args {
     /// Most samples a second of each item [default: 1 Hz for items of other hosts, all for those of this one]
     #[arg(long, value_name = "RATE", value_parser = units::rate)]
     rate: Option<f64>,
+    /// Ask other hosts for every sample that their rings hold, in order, not only for the newest
+    #[arg(long, conflicts_with = "rate")]
+    every: bool,
+    /// Ask other hosts for no sample older than this
+    #[arg(long, value_name = "AGE", value_parser = units::span)]
+    max_age: Option<Duration>,
+    /// Share of a link that cannot carry all: background, low, normal, high or command
+    #[arg(long, value_name = "P", value_parser = priority, default_value = "normal")]
+    priority: Priority,
     /// Stop after so many samples
     #[arg(long, value_name = "N")]
     count: Option<u64>,
@@ -33,7 +42,7 @@ pub(crate) struct Args {
 struct Watch<'a> {
     store: &'a Store,
     pattern: Pattern,
-    rate: Option<f64>,
+    options: ReaderOptions,
     open: BTreeMap<String, Subscription>,
 }
 
@@ -43,7 +52,17 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
     let mut watch = Watch {
         store: &store,
         pattern: pattern(&store, args.pattern.as_deref())?,
-        rate: args.rate,
+        options: ReaderOptions {
+            rate: args.rate,
+            max_age: args.max_age,
+            delivery: if args.every {
+                Delivery::Every
+            } else {
+                Delivery::Latest
+            },
+            priority: args.priority,
+            ..ReaderOptions::default()
+        },
         open: BTreeMap::new(),
     };
     let end = args
@@ -73,6 +92,20 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         .with_hint(format!("`ddx ls '{name}'` and `ddx why NAME` say why")))
 }
 
+/// A priority by its name.
+fn priority(text: &str) -> Result<Priority, String> {
+    match text {
+        "background" => Ok(Priority::Background),
+        "low" => Ok(Priority::Low),
+        "normal" => Ok(Priority::Normal),
+        "high" => Ok(Priority::High),
+        "command" => Ok(Priority::Command),
+        other => Err(format!(
+            "`{other}` is no priority: background, low, normal, high, command"
+        )),
+    }
+}
+
 impl Watch<'_> {
     /// Opens readers for items that are new, and drops those of items that are gone.
     fn refresh(&mut self) -> Result<(), Failure> {
@@ -88,8 +121,11 @@ impl Watch<'_> {
         for name in names {
             if !self.open.contains_key(name.as_str()) {
                 let local = name.is_under(self.store.host()) || name.is_admin();
-                let rate = self.rate.or((!local).then_some(REMOTE_RATE_HZ));
-                let subscription = Subscription::open(self.store, name.as_str(), rate)?;
+                let mut options = self.options;
+                if !local && options.delivery == Delivery::Latest {
+                    options.rate = options.rate.or(Some(REMOTE_RATE_HZ));
+                }
+                let subscription = Subscription::open(self.store, name.as_str(), options)?;
                 self.open.insert(name.to_string(), subscription);
             }
         }

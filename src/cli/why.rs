@@ -232,7 +232,7 @@ impl Reason {
 #[cfg(test)]
 mod tests {
     use ddx_store::{ItemEntry, ReaderEntry};
-    use ddx_wire::{Epoch, HostName, SchemaHash, Time};
+    use ddx_wire::{Contract, Epoch, HostName, SchemaHash, Time};
 
     use super::*;
 
@@ -296,7 +296,7 @@ mod tests {
         silent.readers.push(ReaderEntry {
             program: "map".to_owned(),
             pid: 7,
-            rate_mhz: None,
+            contract: Contract::default(),
             bound: true,
             refused: None,
         });
@@ -307,7 +307,7 @@ mod tests {
         refused.readers.push(ReaderEntry {
             program: "map".to_owned(),
             pid: 7,
-            rate_mhz: None,
+            contract: Contract::default(),
             bound: false,
             refused: Some("field `latitude` is f32, f64 expected".to_owned()),
         });

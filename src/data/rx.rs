@@ -10,8 +10,9 @@ use std::time::Duration;
 use anyhow::Context;
 use ddx_catalog::delivery::{Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent};
 use ddx_store::{Origin, RawWriter};
+use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::Opener;
-use ddx_wire::{ClockOffset, Epoch, Seq, StreamId, Tag, Time};
+use ddx_wire::{ClockOffset, Contract, Epoch, Seq, StreamId, Tag, Time};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::{Traffic, count, mailbox};
@@ -46,8 +47,11 @@ pub(crate) enum Order {
     Expect {
         tag: Tag,
         stream: StreamId,
+        contract: Contract,
         mirror: MirrorId,
     },
+    /// How long a sender's answers take.
+    RoundTrip { tag: Tag, time: Duration },
     /// A stream is over.
     Forget { tag: Tag, stream: StreamId },
     /// A peer's clock against ours.
@@ -68,6 +72,10 @@ pub(crate) enum Notice {
     },
     /// Samples of a stream arrive by multicast.
     OnGroup { tag: Tag, stream: StreamId },
+    /// How a sender's datagrams arrive.
+    Report(Tag, ReportEntry),
+    /// What is missing.
+    Nack(Tag, NackEntry),
     /// The receiver's counters, once a second while something arrives.
     Counters(Box<ReceiverCounters>),
 }
@@ -168,6 +176,7 @@ impl State {
             }
             let now = ddx_store::now();
             self.receiver.handle_timeout(now);
+            self.inbound.take(&mut self.receiver, now);
             self.report(now);
             if !self.spin {
                 ready = self.sleep([sockets[0].as_fd(), sockets[1].as_fd(), inbox.as_fd()], now);
@@ -252,13 +261,15 @@ impl State {
                 self.inbound.mirrors.remove(&mirror);
                 self.inbound.streams.retain(|_key, id| *id != mirror);
             }
+            Order::RoundTrip { tag, time } => self.receiver.round_trip(tag, time),
             Order::Expect {
                 tag,
                 stream,
+                contract,
                 mirror,
             } => {
                 let now = ddx_store::now();
-                self.receiver.listen(tag, stream, now);
+                self.receiver.listen(tag, stream, &contract, now);
                 self.inbound.streams.insert((tag, stream), mirror);
                 self.inbound.take(&mut self.receiver, now);
             }
@@ -301,6 +312,8 @@ impl State {
                     quiet: false,
                 },
                 ReceiverEvent::OnGroup { tag, stream } => Notice::OnGroup { tag, stream },
+                ReceiverEvent::Report(tag, report) => Notice::Report(tag, report),
+                ReceiverEvent::Nack(tag, nack) => Notice::Nack(tag, nack),
             };
             // A full queue costs one acknowledgement, which the next renewal makes good.
             self.notices.send(notice).ok();

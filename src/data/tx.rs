@@ -10,8 +10,9 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use anyhow::Context;
-use ddx_catalog::delivery::{Due, Route, Sender, SenderConfig, SenderEvent};
-use ddx_store::{Meta, RawGuard, RawReader, Store, WaitKey, WaitSet, Waker};
+use ddx_catalog::delivery::{Due, Fetch, Route, Sender, SenderConfig, SenderEvent, Want};
+use ddx_store::{Cursor, Meta, RawGuard, RawReader, Store, WaitKey, WaitSet, Waker};
+use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::sample::SampleMeta;
 use ddx_wire::seal::Sealer;
 use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
@@ -49,6 +50,10 @@ pub(crate) enum Order {
     },
     /// How long a reading host's answers take.
     RoundTrip { tag: Tag, time: Duration },
+    /// How datagrams reach a reading host.
+    Report { tag: Tag, report: ReportEntry },
+    /// What a reading host lacks.
+    Nack { tag: Tag, nack: NackEntry },
     /// End the thread.
     Stop,
 }
@@ -62,7 +67,7 @@ pub(crate) struct Tx {
 
 struct State {
     channel: Channel,
-    sender: Sender,
+    sender: Sender<Payload>,
     set: WaitSet,
     streams: HashMap<StreamId, Stream>,
     by_key: HashMap<WaitKey, StreamId>,
@@ -71,13 +76,17 @@ struct State {
     spin: bool,
 }
 
+/// A sample held in place while its fragments leave.
+#[derive(Clone)]
+struct Payload(Arc<RawGuard>);
+
 /// One item under one contract, on its way out.
 struct Stream {
     key: WaitKey,
     limited: bool,
     newest: (Epoch, Seq),
-    /// Samples of this epoch that were not sent: over the rate, or overwritten before they were read.
-    filtered: u64,
+    /// Where the newest sample lay, from which the places of others follow.
+    cursor: Cursor,
     /// When the rate allows the next sample, if one is waiting for that.
     due: Option<Time>,
 }
@@ -153,7 +162,6 @@ impl State {
             let now = ddx_store::now();
             self.pull_due(now);
             self.sender.handle_timeout(now);
-            self.repeat();
             self.send();
             let timeout = if self.spin {
                 Duration::ZERO
@@ -186,8 +194,8 @@ impl State {
                 route,
                 reader,
             } => {
-                let limited = route.contract.max_rate_mhz.is_some();
-                self.sender.open(stream, route, now);
+                let limited = route.contract.interval_ns() > 0;
+                self.sender.open(stream, &route, now);
                 let key = self.set.add(*reader);
                 self.by_key.insert(key, stream);
                 self.streams.insert(
@@ -196,12 +204,12 @@ impl State {
                         key,
                         limited,
                         newest: Default::default(),
-                        filtered: 0,
+                        cursor: Cursor::default(),
                         due: None,
                     },
                 );
             }
-            Order::Update { stream, route } => self.sender.update(stream, route, now),
+            Order::Update { stream, route } => self.sender.update(stream, &route, now),
             Order::Close(stream) => {
                 self.sender.close(stream);
                 if let Some(closed) = self.streams.remove(&stream) {
@@ -210,6 +218,8 @@ impl State {
                 }
             }
             Order::RoundTrip { tag, time } => self.sender.round_trip(tag, time),
+            Order::Report { tag, report } => self.sender.handle_report(tag, &report, now),
+            Order::Nack { tag, nack } => self.sender.handle_nack(tag, &nack, now),
             Order::Held {
                 stream,
                 tag,
@@ -248,7 +258,7 @@ impl State {
                 reader.next_pinned(Duration::ZERO)
             };
             match read {
-                Ok(Some(guard)) if stream.is_new(guard.meta()) => stream.write(id, &guard, sender),
+                Ok(Some(guard)) if stream.is_new(guard.meta()) => stream.write(id, guard, sender),
                 Ok(Some(_)) if !stream.limited => {}
                 Ok(_) => return,
                 Err(error) => {
@@ -273,26 +283,24 @@ impl State {
         }
     }
 
-    fn repeat(&mut self) {
-        while let Some(event) = self.sender.poll_event() {
-            let SenderEvent::Repeat { stream: id, to } = event;
-            let Some(stream) = self.streams.get_mut(&id) else {
-                continue;
-            };
-            let Some(reader) = self.set.reader(stream.key) else {
-                continue;
-            };
-            if let Ok(Some(guard)) = reader.current_pinned() {
-                let meta = stream.meta(guard.meta());
-                self.sender
-                    .repeat(id, to, &meta, guard.bytes(), ddx_store::now());
-            }
+    /// Reads from the store what the paths have room for.
+    fn fetch(&mut self) {
+        while let Some(SenderEvent::Fetch(fetch)) = self.sender.poll_event() {
+            let stream = self.streams.get_mut(&fetch.stream);
+            let found = stream.and_then(|stream| {
+                let reader = self.set.reader(stream.key)?;
+                let guard = stream.find(&fetch, reader)?;
+                Some((sample_meta(guard.meta()), Payload(Arc::new(guard))))
+            });
+            let found = found.as_ref().map(|(meta, payload)| (meta, payload));
+            self.sender.fetched(&fetch, found, ddx_store::now());
         }
     }
 
     fn send(&mut self) {
-        self.sender.flush(ddx_store::now());
         loop {
+            self.fetch();
+            self.sender.flush(ddx_store::now());
             let Some(transmit) = self.sender.poll_transmit(&mut self.datagrams) else {
                 return;
             };
@@ -319,28 +327,71 @@ impl Stream {
         (meta.epoch, meta.seq) > self.newest
     }
 
-    fn write(&mut self, id: StreamId, guard: &RawGuard, sender: &mut Sender) {
-        let meta = self.meta(guard.meta());
+    fn write(&mut self, id: StreamId, guard: RawGuard, sender: &mut Sender<Payload>) {
+        let meta = sample_meta(guard.meta());
         self.newest = (meta.epoch, meta.seq);
-        self.filtered = meta.filtered;
-        sender.write(id, &meta, guard.bytes(), ddx_store::now());
+        self.cursor = guard.meta().cursor();
+        sender.write(id, &meta, &Payload(Arc::new(guard)), ddx_store::now());
     }
 
-    /// What is told about a sample: all that lies between it and the last one sent was left out here.
-    fn meta(&self, meta: &Meta) -> SampleMeta {
-        let (epoch, Seq(last)) = self.newest;
-        let filtered = if meta.epoch == epoch {
-            self.filtered
-                .saturating_add(meta.seq.0.saturating_sub(last).saturating_sub(1))
-        } else {
-            meta.seq.0.saturating_sub(1)
+    /// The sample that is wanted, while the store has it.
+    fn find(&mut self, fetch: &Fetch, reader: &mut RawReader) -> Option<RawGuard> {
+        let read = match fetch.want {
+            Want::Newest => reader.current_pinned(),
+            Want::After(epoch, seq) => reader.after_pinned(&self.cursor_of(epoch, seq)),
+            Want::At(epoch, Seq(seq)) => {
+                reader.after_pinned(&self.cursor_of(epoch, Seq(seq.saturating_sub(1))))
+            }
         };
-        SampleMeta {
-            epoch: meta.epoch,
-            seq: meta.seq,
-            filtered,
-            capture: meta.capture,
-            publish: meta.publish,
+        match read {
+            Ok(guard) => {
+                if let Some(guard) = &guard
+                    && self.is_new(guard.meta())
+                {
+                    self.newest = (guard.meta().epoch, guard.meta().seq);
+                    self.cursor = guard.meta().cursor();
+                }
+                guard
+            }
+            Err(error) => {
+                tracing::debug!(%error, stream = fetch.stream.0, "reading an item to send");
+                None
+            }
         }
+    }
+
+    /// Where a sample lies: as many places before the newest one as its number is smaller.
+    fn cursor_of(&self, epoch: Epoch, seq: Seq) -> Cursor {
+        let near = Cursor {
+            epoch,
+            seq,
+            ..Cursor::default()
+        };
+        let ahead = self.cursor.seq.0.checked_sub(seq.0);
+        match ahead.and_then(|ahead| self.cursor.pos.checked_sub(ahead)) {
+            Some(pos) if epoch == self.cursor.epoch => Cursor {
+                segment: self.cursor.segment,
+                pos,
+                ..near
+            },
+            Some(_) | None => near,
+        }
+    }
+}
+
+impl AsRef<[u8]> for Payload {
+    fn as_ref(&self) -> &[u8] {
+        self.0.bytes()
+    }
+}
+
+/// What is told about a sample. How many were left out before it is the sender's to say.
+fn sample_meta(meta: &Meta) -> SampleMeta {
+    SampleMeta {
+        epoch: meta.epoch,
+        seq: meta.seq,
+        filtered: 0,
+        capture: meta.capture,
+        publish: meta.publish,
     }
 }

@@ -7,12 +7,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use ddx_catalog::delivery::{Path, ReceiverConfig, ReceiverCounters, Route};
+use ddx_catalog::delivery::{ReceiverConfig, ReceiverCounters, Route};
 use ddx_catalog::{Catalog, Config as CatalogConfig, Dest, Event, beacon_group, sample_group};
 use ddx_store::server::{Event as StoreEvent, Handle, RemoteItem};
 use ddx_store::{ReaderOptions, Schema, Store, WriterOptions};
 use ddx_wire::seal::{DomainKey, Purpose, Sealer};
-use ddx_wire::{HostId, HostName, ItemDescription, ItemName, StreamId, Tag};
+use ddx_wire::{Contract, Delivery, HostId, HostName, ItemDescription, ItemName, StreamId, Tag};
 use socket2::SockRef;
 use tokio::io::Interest;
 use tokio::net::{UdpSocket, UnixStream};
@@ -30,6 +30,11 @@ use crate::net::{self, Channel, Interface, Members, Outlets, Sockets, Watch};
 const NOTICES: usize = 4096;
 /// Datagrams taken from one socket before the loop looks at anything else.
 const DATAGRAMS_PER_TURN: usize = 64;
+/// Samples that a mirror holds where each one is wanted, and bytes that these may take.
+const EVERY_DEPTH: u32 = 1_024;
+const EVERY_BYTES: u32 = 64 << 20;
+/// Samples of one item that the sending thread may hold in place, beyond the two of every reader.
+const TX_PINS: u32 = 6;
 /// Larger than any control datagram.
 const CONTROL_BUFFER_BYTES: usize = 2048;
 
@@ -384,6 +389,10 @@ impl Network {
                 rx::Notice::OnGroup { tag, stream } => {
                     self.catalog.heard_on_group(tag, stream, ddx_store::now());
                 }
+                rx::Notice::Report(tag, report) => {
+                    self.catalog.report(tag, report, ddx_store::now());
+                }
+                rx::Notice::Nack(tag, nack) => self.catalog.nack(tag, nack, ddx_store::now()),
                 rx::Notice::Counters(counters) => self.received = *counters,
             }
         }
@@ -509,12 +518,15 @@ impl Network {
                     seq,
                 })?;
             }
+            Event::Report { tag, report } => self.tx.order(tx::Order::Report { tag, report })?,
+            Event::Nack { tag, nack } => self.tx.order(tx::Order::Nack { tag, nack })?,
             Event::Expect {
                 tag,
                 stream,
                 name,
                 description,
-            } => self.expect_stream(tag, stream, &name, description)?,
+                contract,
+            } => self.expect_stream((tag, stream), &name, description, contract)?,
             Event::Forget { tag, stream } => {
                 for mirror in self
                     .mirrors
@@ -539,6 +551,7 @@ impl Network {
                 // The bound is half the round trip and some drift, so that twice the bound covers the round trip.
                 let time = Duration::from_nanos(offset.bound_ns.saturating_mul(2));
                 self.tx.order(tx::Order::RoundTrip { tag, time })?;
+                self.rx.order(rx::Order::RoundTrip { tag, time })?;
                 self.rx.order(rx::Order::Clock { tag, offset })?;
             }
         }
@@ -551,10 +564,12 @@ impl Network {
         name: &ItemName,
         route: Route,
     ) -> anyhow::Result<()> {
-        let reader = match self
-            .tx_store
-            .raw_reader(name.as_str(), None, ReaderOptions::default())
-        {
+        // Large samples are held in place while their fragments leave, perhaps one for each path.
+        let options = ReaderOptions {
+            pins: TX_PINS,
+            ..ReaderOptions::default()
+        };
+        let reader = match self.tx_store.raw_reader(name.as_str(), None, options) {
             Ok(reader) => reader,
             Err(error) => {
                 tracing::warn!(item = %name, %error, "item cannot be read to be sent");
@@ -570,21 +585,20 @@ impl Network {
     }
 
     fn follow_route(&self, stream: StreamId, route: &Route) {
-        let group = match route.path {
-            Path::Unicast => None,
-            Path::Multicast(group) | Path::Both(group) => Some(group),
-        };
-        let readers = route.readers.iter().map(|reader| reader.addr);
-        self.outlets.route(stream, group, readers);
+        let members = route.readers.iter();
+        let members = members.filter(|reader| reader.via.group().is_some());
+        let group = members.clone().find_map(|reader| reader.via.group());
+        self.outlets
+            .route(stream, group, members.map(|reader| reader.addr));
     }
 
     /// Makes ready for the samples of a stream: a mirror in the store, and the order to write it.
     fn expect_stream(
         &mut self,
-        tag: Tag,
-        stream: StreamId,
+        (tag, stream): (Tag, StreamId),
         name: &ItemName,
         description: ItemDescription,
+        contract: Contract,
     ) -> anyhow::Result<()> {
         let fits = |mirror: &Mirror| {
             mirror.description.schema_hash == description.schema_hash
@@ -598,7 +612,7 @@ impl Network {
                 mirror.stream = Some((tag, stream));
                 mirror.id
             }
-            None => match self.open_mirror(name, description, (tag, stream)) {
+            None => match self.open_mirror(name, description, contract, (tag, stream)) {
                 Ok(id) => id,
                 Err(error) => {
                     tracing::warn!(item = %name, error = %format!("{error:#}"), "item cannot be mirrored");
@@ -609,6 +623,7 @@ impl Network {
         self.rx.order(rx::Order::Expect {
             tag,
             stream,
+            contract,
             mirror: id,
         })
     }
@@ -617,6 +632,7 @@ impl Network {
         &mut self,
         name: &ItemName,
         description: ItemDescription,
+        contract: Contract,
         stream: (Tag, StreamId),
     ) -> anyhow::Result<MirrorId> {
         let text = self
@@ -629,10 +645,15 @@ impl Network {
             schema.hash() == description.schema_hash,
             "its owner's schema is not the one announced"
         );
-        let options = WriterOptions {
+        let mut options = WriterOptions {
             capacity_bytes: Some(description.capacity_bytes),
             ..WriterOptions::default()
         };
+        if contract.delivery != Delivery::Latest {
+            // What comes in a burst of repairs must wait for the readers of this host.
+            let fits = EVERY_BYTES / description.capacity_bytes.max(1);
+            options.depth = fits.clamp(options.depth, EVERY_DEPTH);
+        }
         let writer = self.store.raw_writer(name.as_str(), &schema, options)?;
         self.last_mirror += 1;
         let id = MirrorId(self.last_mirror);

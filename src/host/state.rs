@@ -13,7 +13,7 @@ use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::Context as _;
-use ddx_catalog::delivery::Path;
+use ddx_catalog::delivery::{Route, Via};
 use ddx_catalog::{HostState, HostStatus, PathStatus, StreamIn, StreamOut};
 use ddx_store::server::Handle;
 use ddx_store::{RawWriter, Schema, Store, WriterOptions};
@@ -201,7 +201,7 @@ fn clock(status: &HostStatus) -> Option<Value> {
 
 fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
     let out = network.catalog().streams_out().into_iter().map(|stream| {
-        let (path, group) = path(stream.route.path);
+        let (path, group) = path(&stream.route);
         json!({
             "name": stream.name.as_str(),
             "direction": "out",
@@ -209,7 +209,7 @@ fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
             "peers": peers(&stream, hosts),
             "path": path,
             "group": group,
-            "max_rate_mhz": stream.route.contract.max_rate_mhz,
+            "contract": stream.route.contract.to_string(),
         })
     });
     let into = network.catalog().streams_in().into_iter().map(|stream| {
@@ -220,7 +220,7 @@ fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
             "peers": stream.tag.map(|tag| name_of(tag, hosts)).into_iter().collect::<Vec<_>>(),
             "path": stream.stream.map(|_granted| path_in(&stream)),
             "group": stream.group,
-            "max_rate_mhz": stream.contract.max_rate_mhz,
+            "contract": stream.contract.to_string(),
         })
     });
     out.chain(into).collect()
@@ -230,16 +230,7 @@ fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
 fn notes(network: &Network, hosts: &[HostStatus]) -> BTreeMap<ItemName, String> {
     let mut notes: BTreeMap<ItemName, String> = BTreeMap::new();
     for stream in network.catalog().streams_out() {
-        let (path, group) = path(stream.route.path);
-        let group = group.map_or_else(String::new, |group| format!(" {group}"));
-        let limit = stream.route.contract.max_rate_mhz;
-        let limit = limit.map_or_else(String::new, |mhz| {
-            format!(", at most {} Hz", f64::from(mhz) / 1000.0)
-        });
-        let line = format!(
-            "{path}{group} to {}{limit}",
-            peers(&stream, hosts).join(", ")
-        );
+        let line = format!("{}, {}", ways(&stream, hosts), stream.route.contract);
         let note = notes.entry(stream.name).or_default();
         if !note.is_empty() {
             note.push_str("; ");
@@ -260,12 +251,43 @@ fn notes(network: &Network, hosts: &[HostStatus]) -> BTreeMap<ItemName, String> 
     notes
 }
 
-fn path(path: Path) -> (&'static str, Option<SocketAddr>) {
-    match path {
-        Path::Unicast => ("unicast", None),
-        Path::Multicast(group) => ("multicast", Some(group)),
-        Path::Both(group) => ("both", Some(group)),
+/// How a stream goes out, in one word, and the group that it uses.
+fn path(route: &Route) -> (&'static str, Option<SocketAddr>) {
+    let group = route.readers.iter().find_map(|reader| reader.via.group());
+    let path = if route.is_by_unicast() {
+        "unicast"
+    } else if route.is_by_group() {
+        "multicast"
+    } else {
+        "both"
+    };
+    (path, group)
+}
+
+/// To whom a stream goes by which way, and why not by multicast where that was tried.
+fn ways(stream: &StreamOut, hosts: &[HostStatus]) -> String {
+    let mut ways: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for (reader, choice) in stream.route.readers.iter().zip(&stream.choices) {
+        let way = match reader.via {
+            Via::Unicast => "unicast".to_owned(),
+            Via::Group(group) => format!("multicast {group}"),
+            Via::Both(group) => format!("both unicast and multicast {group}"),
+        };
+        let mut name = name_of(reader.tag, hosts);
+        if choice.shuns_group && reader.via == Via::Unicast {
+            name.push_str(&format!(
+                " (multicast loses too much; unicast loses {:.1} %, since {:.0} s)",
+                choice.unicast_loss * 100.0,
+                ddx_store::now().since(choice.since).as_secs_f64()
+            ));
+        }
+        ways.entry(way).or_default().push(name);
     }
+    let ways: Vec<_> = ways
+        .into_iter()
+        .map(|(way, names)| format!("{way} to {}", names.join(", ")))
+        .collect();
+    ways.join(" and ")
 }
 
 fn path_in(stream: &StreamIn) -> &'static str {

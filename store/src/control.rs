@@ -5,7 +5,7 @@
 //! File descriptors ride beside a message: a segment is always two, `data` then `ctl`.
 
 use ddx_wire::codec::{self, CodecError};
-use ddx_wire::{Epoch, HostName, ItemName, SchemaHash, Time, WriterState};
+use ddx_wire::{Contract, Epoch, HostName, ItemName, SchemaHash, Time, WriterState};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -96,8 +96,8 @@ pub enum Request {
         schema: Option<String>,
         /// Pins beyond the two that each reader has.
         pins: u32,
-        /// Greatest rate, thousandths of a hertz.
-        rate_mhz: Option<u32>,
+        /// What it asks of the source.
+        contract: Contract,
         /// Place in a segment that a former daemon gave, which the reader still uses.
         held: Option<HeldCell>,
     },
@@ -323,8 +323,8 @@ pub struct ReaderEntry {
     pub program: String,
     /// Its process.
     pub pid: u32,
-    /// Greatest rate that it asked for, thousandths of a hertz.
-    pub rate_mhz: Option<u32>,
+    /// What it asks of the source.
+    pub contract: Contract,
     /// Whether it has a place in the item's segment.
     pub bound: bool,
     /// Why it was refused, if it was.

@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 use std::time::Duration;
 
-use ddx_wire::{Contract, Epoch, ItemName, Seq, Time};
+use ddx_wire::{Contract, Delivery, Epoch, ItemName, Priority, Seq, Time};
 
 use crate::clock;
 use crate::connection::{Connection, Mail, Mailbox, segment_fds};
@@ -40,6 +40,12 @@ pub struct ReaderOptions {
     /// Greatest rate, hertz: `next` then gives the newest sample at each turn, and what it passes over counts as
     /// filtered. From another host no more than this is sent.
     pub rate: Option<f64>,
+    /// Greatest age, since capture, at which a sample of another host is still sent; whole milliseconds.
+    pub max_age: Option<Duration>,
+    /// Whether samples of another host that are lost on the way are sent again. On one host each sample is in the ring.
+    pub delivery: Delivery,
+    /// Which items come first where a link between hosts cannot carry all.
+    pub priority: Priority,
     /// Where `next` begins.
     pub from: From,
 }
@@ -101,6 +107,45 @@ struct Registered {
     connection: Arc<Connection>,
     handle: u32,
     name: ItemName,
+}
+
+impl ReaderOptions {
+    /// What these options ask of the source.
+    fn contract(&self) -> Result<Contract, Error> {
+        let limited = match self.rate {
+            None => Contract::default(),
+            Some(rate) if self.delivery == Delivery::Latest => Contract::at_most_hz(rate)
+                .ok_or_else(|| {
+                    Error::Argument(format!("rate of {rate} Hz; hint: at least 0.001 Hz"))
+                })?,
+            Some(rate) => {
+                return Err(Error::Argument(format!(
+                    "rate of {rate} Hz beside delivery of every sample; hint: leave one of them out"
+                )));
+            }
+        };
+        let max_age_ms = match self.max_age {
+            None => None,
+            Some(age) => match u32::try_from(age.as_millis()) {
+                Ok(ms) if ms > 0 => Some(ms),
+                Ok(_) | Err(_) => {
+                    return Err(Error::Argument(format!(
+                        "greatest age of {age:?}; hint: between 1 ms and 49 days"
+                    )));
+                }
+            },
+        };
+        let delivery = match (self.delivery, self.from) {
+            (Delivery::Every, From::Ring) => Delivery::EveryFromRing,
+            (delivery, _) => delivery,
+        };
+        Ok(Contract {
+            max_age_ms,
+            delivery,
+            priority: self.priority,
+            ..limited
+        })
+    }
 }
 
 impl<T: Item> Reader<T> {
@@ -175,7 +220,7 @@ impl RawReader {
         schema: Option<&Schema>,
         options: ReaderOptions,
     ) -> Result<Self, Error> {
-        let contract = contract(options.rate)?;
+        let contract = options.contract()?;
         let handle = connection.new_handle();
         let schema = schema.map(|schema| schema.text().to_owned());
         let request = Request::OpenReader {
@@ -183,7 +228,7 @@ impl RawReader {
             name: name.to_owned(),
             schema: schema.clone(),
             pins: options.pins,
-            rate_mhz: contract.max_rate_mhz,
+            contract,
             held: None,
         };
         let mailbox = Arc::<Mailbox>::default();
@@ -200,7 +245,7 @@ impl RawReader {
             name: name.to_string(),
             schema,
             pins: options.pins,
-            rate_mhz: contract.max_rate_mhz,
+            contract,
             held: None,
             mailbox: Arc::clone(&mailbox),
         };
@@ -300,32 +345,21 @@ impl RawReader {
         cursor: &Cursor,
         payload: &mut Vec<u8>,
     ) -> Result<(Option<Meta>, Missed), Error> {
-        self.look()?;
-        let Some(Bound { segment, .. }) = &self.bound else {
-            return Ok((None, Missed::default()));
-        };
         let mut copier = Copier::new(payload);
-        let head = segment.head_pos();
-        let mut pos = match segment.epoch() == cursor.segment {
-            true => cursor.pos.saturating_add(1),
-            false => 1,
+        let read = |segment: &SegmentReader, pos| {
+            copier.copy(segment, pos)?;
+            Ok(copier.stamp())
         };
-        pos = pos.max(oldest(segment, head));
-        while pos <= head {
-            match copier.copy(segment, pos).map(|()| copier.stamp()) {
-                Ok(stamp) if cursor.is_before(stamp.origin.epoch, stamp.origin.seq) => {
-                    let meta = meta(&stamp, segment);
-                    return Ok((Some(meta), cursor.missed_until(&meta)));
-                }
-                Ok(_) => pos += 1,
-                Err(PinError::Overwritten) => {
-                    pos = (pos + 1).max(oldest(segment, segment.head_pos()));
-                }
-                Err(PinError::NotYet) => break,
-                Err(error) => return Err(pin_error(error, segment)),
-            }
-        }
-        Ok((None, Missed::default()))
+        Ok(match self.after_with(cursor, read, |stamp| *stamp)? {
+            Some((_, meta)) => (Some(meta), cursor.missed_until(&meta)),
+            None => (None, Missed::default()),
+        })
+    }
+
+    /// The oldest sample after `cursor` that is still there, in place, at once.
+    pub fn after_pinned(&mut self, cursor: &Cursor) -> Result<Option<RawGuard>, Error> {
+        let read = self.after_with(cursor, SegmentReader::pin, |pin: &Pin| *pin.stamp())?;
+        Ok(read.map(|(pin, meta)| self.guard(pin, meta)))
     }
 
     /// The item's name.
@@ -359,6 +393,41 @@ impl RawReader {
             self.seen = meta.cursor();
         }
         meta
+    }
+
+    fn after_with<R>(
+        &mut self,
+        cursor: &Cursor,
+        mut read: impl FnMut(&SegmentReader, u64) -> Result<R, PinError>,
+        stamp: impl Fn(&R) -> Stamp,
+    ) -> Result<Option<(R, Meta)>, Error> {
+        self.look()?;
+        let Some(Bound { segment, .. }) = &self.bound else {
+            return Ok(None);
+        };
+        let head = segment.head_pos();
+        let mut pos = match segment.epoch() == cursor.segment {
+            true => cursor.pos.saturating_add(1),
+            false => 1,
+        };
+        pos = pos.max(oldest(segment, head));
+        while pos <= head {
+            match read(segment, pos) {
+                Ok(found) => {
+                    let meta = meta(&stamp(&found), segment);
+                    if cursor.is_before(meta.epoch, meta.seq) {
+                        return Ok(Some((found, meta)));
+                    }
+                    pos += 1;
+                }
+                Err(PinError::Overwritten) => {
+                    pos = (pos + 1).max(oldest(segment, segment.head_pos()));
+                }
+                Err(PinError::NotYet) => break,
+                Err(error) => return Err(pin_error(error, segment)),
+            }
+        }
+        Ok(None)
     }
 
     fn next_with<R>(
@@ -666,14 +735,6 @@ fn read_or_next<R>(
 /// First position that may still be in the ring when `head` is the newest.
 fn oldest(segment: &SegmentReader, head: u64) -> u64 {
     head.saturating_sub(segment.depth()).saturating_add(1)
-}
-
-fn contract(rate: Option<f64>) -> Result<Contract, Error> {
-    match rate {
-        None => Ok(Contract::default()),
-        Some(rate) => Contract::at_most_hz(rate)
-            .ok_or_else(|| Error::Argument(format!("rate of {rate} Hz; hint: at least 0.001 Hz"))),
-    }
 }
 
 #[inline]

@@ -7,6 +7,8 @@ use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::Instant;
 
+use ddx_wire::Contract;
+
 use crate::connection::{Mail, Mailbox, State, TIMEOUT, segment_fds};
 use crate::control::{Binding, HeldCell, Refusal, Reply, Request};
 use crate::error::Error;
@@ -27,7 +29,7 @@ pub(crate) enum Registration {
         name: String,
         schema: Option<String>,
         pins: u32,
-        rate_mhz: Option<u32>,
+        contract: Contract,
         held: Option<HeldCell>,
         mailbox: Arc<Mailbox>,
     },
@@ -58,7 +60,7 @@ impl Registration {
                 name,
                 schema,
                 pins,
-                rate_mhz,
+                contract,
                 held,
                 ..
             } => Request::OpenReader {
@@ -66,7 +68,7 @@ impl Registration {
                 name: name.clone(),
                 schema: schema.clone(),
                 pins: *pins,
-                rate_mhz: *rate_mhz,
+                contract: *contract,
                 held: *held,
             },
         }

@@ -155,7 +155,7 @@ fn open_reader(handle: u32, name: &str) -> Request {
         name: name.to_owned(),
         schema: None,
         pins: 0,
-        rate_mhz: None,
+        contract: ddx_wire::Contract::default(),
         held: None,
     }
 }

@@ -216,6 +216,17 @@ impl Catalog {
                 self.tell_clock(tag, now);
             }
             Message::Ack(entries) => self.streams.handle_ack(tag, &entries, out),
+            Message::Report(reports) => {
+                self.streams.handle_report(tag, &reports, now, out);
+                for report in reports {
+                    out.event(Event::Report { tag, report });
+                }
+            }
+            Message::Nack(nacks) => {
+                for nack in nacks {
+                    out.event(Event::Nack { tag, nack });
+                }
+            }
             Message::Probe { nonce } => out.send_by(tag, from, &Message::Probed { nonce }),
             Message::Probed { nonce } => self.sessions.paths.answered(tag, nonce, now),
             Message::Addresses {

@@ -22,8 +22,10 @@ pub struct Books {
     pub over_budget: u64,
     /// Fragments that contradict one another.
     pub undecodable: u64,
-    /// Left out by the source, as the contract asks.
+    /// Left out by the source, as the contract asks or because the link is slower than the stream.
     pub filtered: u64,
+    /// Gave way to newer ones in the writer's ring before they could be sent, or sent again.
+    pub overwritten: u64,
     /// Further copies of samples or fragments accounted for already, or from before the first delivered sample.
     pub duplicates: u64,
     /// Samples or fragments of an epoch that is over.
@@ -56,6 +58,8 @@ pub(super) struct Ledger {
     newest: Option<Newest>,
     /// Samples newer than the newest that failed; a repeat may still deliver them. Sorted, at most [`FAILURES`].
     failed: Vec<(Epoch, Seq, Failure)>,
+    /// Samples before the next that the source says are gone.
+    gone: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -132,7 +136,9 @@ impl Ledger {
         books.expected = books.expected.saturating_add(skipped).saturating_add(1);
         books.delivered += 1;
         books.filtered = books.filtered.saturating_add(filtered);
-        books.link_lost = books.link_lost.saturating_add(skipped - filtered);
+        let gone = std::mem::take(&mut self.gone).min(skipped - filtered);
+        books.overwritten = books.overwritten.saturating_add(gone);
+        books.link_lost = books.link_lost.saturating_add(skipped - filtered - gone);
         let mut newest = Newest {
             epoch: meta.epoch,
             seq: meta.seq,
@@ -155,6 +161,16 @@ impl Ledger {
             (*epoch, *seq) > key(meta)
         });
         self.newest = Some(newest);
+    }
+
+    /// Notes that so many samples before the next one cannot be had.
+    pub(super) fn gone(&mut self, count: u64) {
+        self.gone = self.gone.saturating_add(count);
+    }
+
+    /// Counts a further copy of a sample that is here and not delivered yet.
+    pub(super) fn duplicate(&mut self) {
+        self.books.duplicates += 1;
     }
 
     /// Notes that a [`Standing::Newer`] sample was dropped. It is booked once a newer one is delivered.
@@ -191,6 +207,7 @@ impl Books {
             self.over_budget,
             self.undecodable,
             self.filtered,
+            self.overwritten,
         ];
         accounted.into_iter().fold(0, u64::saturating_add) == self.expected
     }
@@ -302,6 +319,18 @@ mod tests {
         ledger.deliver(&meta(1, 4, 0));
         assert_eq!(ledger.books().undecodable, 1);
         assert!(ledger.books().balanced());
+    }
+
+    #[test]
+    fn what_the_source_let_go_is_not_lost_on_the_link() {
+        let mut ledger = after(&[(1, 1, 0)]);
+        ledger.gone(3);
+        ledger.deliver(&meta(1, 6, 0));
+        ledger.gone(9);
+        ledger.deliver(&meta(1, 7, 0));
+        let books = ledger.books();
+        assert_eq!((books.overwritten, books.link_lost), (3, 1));
+        assert!(books.balanced());
     }
 
     #[test]

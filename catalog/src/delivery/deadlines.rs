@@ -39,6 +39,17 @@ impl<K: Ord + Copy> Deadlines<K> {
         }
     }
 
+    pub(super) fn contains(&self, key: &K) -> bool {
+        self.by_key.contains_key(key)
+    }
+
+    /// Sets a deadline, unless the key has an earlier one.
+    pub(super) fn set_earlier(&mut self, key: K, at: Time) {
+        if self.by_key.get(&key).is_none_or(|present| at < *present) {
+            self.set(key, at);
+        }
+    }
+
     pub(super) fn first(&self) -> Option<Time> {
         self.by_time.first().map(|(at, _)| *at)
     }

@@ -89,6 +89,7 @@ mod tests {
         let record = Record {
             stream: StreamId(stream),
             repeat: false,
+            gone: false,
             meta: SampleMeta {
                 seq: Seq(1),
                 ..SampleMeta::default()

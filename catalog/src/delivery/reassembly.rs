@@ -1,31 +1,61 @@
-//! Fragments to samples, under a byte budget and a deadline; the newest sample of a stream wins.
+//! Fragments to samples, under a byte budget and a deadline, and what to ask for again meanwhile.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use ddx_wire::message::NACK_PARTS_MAX;
 use ddx_wire::sample::{Fragment, Record, SampleMeta};
-use ddx_wire::{StreamId, Tag, Time};
+use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::Failure;
 use super::deadlines::Deadlines;
 use super::key;
 
-/// Samples of which some fragments have arrived: at most one for each stream.
+/// Samples of which some fragments have arrived: a few of each stream.
 #[derive(Debug)]
 pub(super) struct Reassembly {
     budget_bytes: usize,
     held_bytes: usize,
-    partials: BTreeMap<(Tag, StreamId), Partial>,
-    deadlines: Deadlines<(Tag, StreamId)>,
+    partials: BTreeMap<Place, Partial>,
+    deadlines: Deadlines<Place>,
+}
+
+/// One sample of one stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Place {
+    pub(super) tag: Tag,
+    pub(super) stream: StreamId,
+    pub(super) epoch: Epoch,
+    pub(super) seq: Seq,
+}
+
+/// How a fragment is to be taken.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Rules {
+    /// Incomplete samples of the stream that may be held.
+    pub(super) depth: usize,
+    /// How long an answer of the sender takes.
+    pub(super) round_trip: Duration,
+    /// How long to wait before asking, so that not all receivers of a group ask at once.
+    pub(super) patience: Duration,
 }
 
 /// What a fragment led to.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Step {
     /// The sample that is whole now.
     pub(super) whole: Option<(SampleMeta, Vec<u8>)>,
-    /// A sample that was given up: the stream's earlier one, or the fragment's own.
+    /// A sample that was given up: an earlier one of the stream, or the fragment's own.
     pub(super) failed: Option<(SampleMeta, Failure)>,
+}
+
+/// What came of a deadline.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Due {
+    /// Ask for these parts: offset and length.
+    Ask(Vec<(u32, u32)>),
+    /// The sample is given up.
+    Expired(SampleMeta),
 }
 
 #[derive(Debug)]
@@ -34,6 +64,14 @@ struct Partial {
     bytes: Vec<u8>,
     /// Ranges that have arrived: sorted, disjoint, never adjacent.
     ranges: Vec<(usize, usize)>,
+    /// When the last fragment came.
+    last: Time,
+    /// Longest fragment: all but the last have its length.
+    step: usize,
+    round_trip: Duration,
+    patience: Duration,
+    /// Requests since the last fragment.
+    asked: u32,
 }
 
 impl Reassembly {
@@ -52,20 +90,23 @@ impl Reassembly {
         tag: Tag,
         record: &Record<'_>,
         fragment: Fragment,
+        rules: Rules,
         now: Time,
     ) -> Step {
-        let at = (tag, record.stream);
+        let place = Place::of(tag, record.stream, &record.meta);
         let mut failed = None;
-        match self.partials.get(&at).map(|p| key(&p.meta)) {
-            Some(present) if present > key(&record.meta) => {
-                return Step::failed(record.meta, Failure::Expired);
+        if !self.partials.contains_key(&place) {
+            let held = self.of(tag, record.stream).map(|(place, _)| *place);
+            let held: Vec<Place> = held.collect();
+            if held.len() >= rules.depth {
+                match held.first() {
+                    // The newest are worth more.
+                    Some(oldest) if *oldest < place => {
+                        failed = self.remove(*oldest).map(|p| (p.meta, Failure::Expired));
+                    }
+                    Some(_) | None => return Step::failed(record.meta, Failure::Expired),
+                }
             }
-            Some(present) if present < key(&record.meta) => {
-                failed = self.remove(at).map(|p| (p.meta, Failure::Expired));
-            }
-            Some(_) | None => {}
-        }
-        if !self.partials.contains_key(&at) {
             let total = usize::try_from(fragment.total).unwrap_or(usize::MAX);
             if total > self.budget_bytes.saturating_sub(self.held_bytes) {
                 // An older sample given up at the same time is left to the books as lost.
@@ -76,67 +117,130 @@ impl Reassembly {
                 meta: record.meta,
                 bytes: vec![0; total],
                 ranges: Vec::new(),
+                last: now,
+                step: 0,
+                round_trip: rules.round_trip,
+                patience: rules.patience,
+                asked: 0,
             };
-            self.partials.insert(at, partial);
+            self.partials.insert(place, partial);
         }
-        // Each fragment prolongs it, so that what one repeat lost the next can bring.
-        self.deadlines.set(at, now + DEADLINE);
-        let added = self
-            .partials
-            .get_mut(&at)
-            .map(|partial| partial.add(fragment, record.payload));
-        match added {
-            Some(Added::Whole) => Step {
-                whole: self.remove(at).map(|partial| (partial.meta, partial.bytes)),
+        let Some(partial) = self.partials.get_mut(&place) else {
+            return Step::default();
+        };
+        (partial.last, partial.asked) = (now, 0);
+        partial.step = partial.step.max(record.payload.len());
+        match partial.add(fragment, record.payload) {
+            Added::Whole => Step {
+                whole: self
+                    .remove(place)
+                    .map(|partial| (partial.meta, partial.bytes)),
                 failed,
             },
-            Some(Added::Contradiction) => {
-                self.remove(at);
+            Added::Contradiction => {
+                self.remove(place);
                 Step::failed(record.meta, Failure::Undecodable)
             }
-            Some(Added::Part) | None => Step {
-                whole: None,
-                failed,
-            },
+            Added::Part => {
+                let wait = if partial.has_gap() {
+                    REORDERING + partial.patience
+                } else {
+                    partial.tail_wait()
+                };
+                // A gap is asked for soon, the end of the sample once nothing comes any more.
+                match partial.has_gap() {
+                    true => self.deadlines.set_earlier(place, now + wait),
+                    false => self.deadlines.set(place, now + wait),
+                }
+                Step {
+                    whole: None,
+                    failed,
+                }
+            }
         }
     }
 
-    /// Gives up the stream's incomplete sample if it is not newer than one that is delivered now.
+    /// Gives up a sample of the stream that is not newer than one that is delivered now.
     pub(super) fn pass(
         &mut self,
         tag: Tag,
         stream: StreamId,
         delivered: &SampleMeta,
     ) -> Option<SampleMeta> {
-        let at = (tag, stream);
-        let pending = self.partials.get(&at)?.meta;
-        if key(&pending) > key(delivered) {
+        let oldest = self.of(tag, stream).next().map(|(place, _)| *place)?;
+        if (oldest.epoch, oldest.seq) > key(delivered) {
             return None;
         }
-        self.remove(at).map(|partial| partial.meta)
+        self.remove(oldest).map(|partial| partial.meta)
     }
 
-    /// Gives up a stream's incomplete sample, if any.
+    /// Gives up a stream's incomplete samples, if any.
     pub(super) fn forget(&mut self, tag: Tag, stream: StreamId) {
-        self.remove((tag, stream));
+        let places: Vec<Place> = self.of(tag, stream).map(|(place, _)| *place).collect();
+        for place in places {
+            self.remove(place);
+        }
+    }
+
+    /// Whether some fragments of a sample have arrived.
+    pub(super) fn has(&self, place: &Place) -> bool {
+        self.partials.contains_key(place)
     }
 
     pub(super) fn deadline(&self) -> Option<Time> {
         self.deadlines.first()
     }
 
-    /// Gives up one sample whose deadline has come.
-    pub(super) fn expire(&mut self, now: Time) -> Option<(Tag, StreamId, SampleMeta)> {
-        let (tag, stream) = self.deadlines.pop(now)?;
-        let partial = self.remove((tag, stream))?;
-        Some((tag, stream, partial.meta))
+    /// Deals with one sample whose deadline has come.
+    pub(super) fn due(&mut self, now: Time) -> Option<(Place, Due)> {
+        let place = self.deadlines.pop(now)?;
+        let partial = self.partials.get_mut(&place)?;
+        if now.since(partial.last) >= GIVE_UP.max(8 * partial.round_trip) {
+            let meta = partial.meta;
+            self.remove(place);
+            return Some((place, Due::Expired(meta)));
+        }
+        let is_quiet = now.since(partial.last) >= partial.tail_wait();
+        let parts = partial.missing(is_quiet);
+        // The answer takes a round trip, and comes at the sender's pace.
+        let backoff = 1 << partial.asked.min(3);
+        partial.asked += 1;
+        let wait = (partial.round_trip + REORDERING) * backoff + partial.patience;
+        self.deadlines.set(place, now + wait);
+        Some((place, Due::Ask(parts)))
     }
 
-    fn remove(&mut self, at: (Tag, StreamId)) -> Option<Partial> {
-        self.deadlines.clear(at);
-        let partial = self.partials.remove(&at)?;
+    fn of(&self, tag: Tag, stream: StreamId) -> impl Iterator<Item = (&Place, &Partial)> {
+        let first = Place {
+            tag,
+            stream,
+            epoch: Epoch(0),
+            seq: Seq(0),
+        };
+        let last = Place {
+            epoch: Epoch(u64::MAX),
+            seq: Seq(u64::MAX),
+            ..first
+        };
+        self.partials.range(first..=last)
+    }
+
+    fn remove(&mut self, place: Place) -> Option<Partial> {
+        self.deadlines.clear(place);
+        let partial = self.partials.remove(&place)?;
         self.held_bytes -= partial.bytes.len();
         Some(partial)
+    }
+}
+
+impl Place {
+    pub(super) fn of(tag: Tag, stream: StreamId, meta: &SampleMeta) -> Self {
+        Self {
+            tag,
+            stream,
+            epoch: meta.epoch,
+            seq: meta.seq,
+        }
     }
 }
 
@@ -156,6 +260,34 @@ enum Added {
 }
 
 impl Partial {
+    fn has_gap(&self) -> bool {
+        self.ranges.len() > 1 || self.ranges.first().is_some_and(|(start, _)| *start > 0)
+    }
+
+    /// How long nothing may come before the rest of the sample is asked for too.
+    fn tail_wait(&self) -> Duration {
+        TAIL.max(self.round_trip / 2) + self.patience
+    }
+
+    /// The parts that lie between those that came, and the rest when `with_tail`.
+    fn missing(&self, with_tail: bool) -> Vec<(u32, u32)> {
+        let mut parts = Vec::new();
+        let mut from = 0;
+        let end = with_tail.then_some((self.bytes.len(), self.bytes.len()));
+        for (start, until) in self.ranges.iter().copied().chain(end) {
+            if start > from
+                && let (Ok(offset), Ok(len)) = (u32::try_from(from), u32::try_from(start - from))
+            {
+                parts.push((offset, len));
+            }
+            if parts.len() == PARTS_MAX {
+                break;
+            }
+            from = until;
+        }
+        parts
+    }
+
     /// Copies a fragment to its place. Fragments repeat or abut; those that overlap in part, or disagree on the length
     /// of the sample, are contradictions.
     fn add(&mut self, fragment: Fragment, payload: &[u8]) -> Added {
@@ -184,7 +316,8 @@ impl Partial {
         if next > 0 {
             self.merge(next - 1);
         }
-        if self.ranges.len() > RANGES {
+        // Fragments have one length, so that honest ones leave no more gaps than that allows.
+        if self.ranges.len() > RANGES.max(total / self.step.max(1)) {
             return Added::Contradiction;
         }
         if self.ranges.as_slice() == [(0, total)] {
@@ -208,15 +341,19 @@ impl Partial {
     }
 }
 
-/// `PROTOCOL.md#fragments`: an incomplete sample is given up 500 ms after its last fragment.
-const DEADLINE: Duration = Duration::from_millis(500);
-/// Gaps in a sample: a sample of 64 KiB in fragments of a full datagram has fewer.
+/// What may come late because it took another way: not asked for yet.
+const REORDERING: Duration = Duration::from_millis(5);
+/// Fragments come at the sender's pace, and may pause while others have their turn.
+const TAIL: Duration = Duration::from_millis(25);
+/// `PROTOCOL.md#fragments`: an incomplete sample is given up 2 s after its last fragment, or 8 round trips.
+const GIVE_UP: Duration = Duration::from_secs(2);
+/// Parts asked for at one time: four messages.
+const PARTS_MAX: usize = 4 * NACK_PARTS_MAX;
+/// Gaps that fragments of any length may leave.
 const RANGES: usize = 64;
 
 #[cfg(test)]
 mod tests {
-    use ddx_wire::Seq;
-
     use super::*;
 
     const TAG: Tag = Tag(1);
@@ -234,11 +371,17 @@ mod tests {
         let record = Record {
             stream: STREAM,
             repeat: false,
+            gone: false,
             meta: meta(seq),
             fragment: Some(fragment),
             payload,
         };
-        r.insert(TAG, &record, fragment, Time(0))
+        let rules = Rules {
+            depth: 1,
+            round_trip: Duration::from_millis(10),
+            patience: Duration::ZERO,
+        };
+        r.insert(TAG, &record, fragment, rules, Time(0))
     }
 
     #[test]
@@ -286,12 +429,45 @@ mod tests {
     }
 
     #[test]
-    fn deadline_frees_the_budget() {
-        let mut r = Reassembly::new(10);
-        insert(&mut r, 1, 6, 0, b"ab");
-        let at = r.deadline().unwrap();
-        assert_eq!(r.expire(Time(at.0 - 1)), None);
-        assert_eq!(r.expire(at), Some((TAG, STREAM, meta(1))));
-        assert_eq!(r.held_bytes, 0);
+    fn what_is_missing_is_asked_for_and_given_up_in_the_end() {
+        let mut r = Reassembly::new(100);
+        insert(&mut r, 1, 10, 2, b"cd");
+        insert(&mut r, 1, 10, 6, b"gh");
+        let mut now = r.deadline().unwrap();
+        assert_eq!(now, Time(0) + REORDERING);
+        let (place, due) = r.due(now).unwrap();
+        assert_eq!((place.seq, due), (Seq(1), Due::Ask(vec![(0, 2), (4, 2)])));
+        // Later the end is asked for as well.
+        let mut asked = 0;
+        loop {
+            now = r.deadline().unwrap();
+            match r.due(now).unwrap().1 {
+                Due::Ask(parts) if now.since(Time(0)) >= TAIL => {
+                    assert_eq!(parts, [(0, 2), (4, 2), (8, 2)]);
+                    asked += 1;
+                }
+                Due::Ask(_) => {}
+                Due::Expired(meta) => break assert_eq!(meta.seq, Seq(1)),
+            }
+        }
+        assert!(
+            asked > 3 && now.since(Time(0)) >= GIVE_UP,
+            "{asked} {now:?}"
+        );
+        assert_eq!((r.held_bytes, r.deadline()), (0, None));
+    }
+
+    #[test]
+    fn many_gaps_of_a_long_sample_are_no_contradiction() {
+        let mut r = Reassembly::new(1 << 20);
+        for at in 0..500 {
+            let step = insert(&mut r, 1, 1_000_000, at * 2_000, &[1; 1_000]);
+            assert_eq!(step, Step::default(), "{at}");
+        }
+        let (_, due) = r.due(r.deadline().unwrap()).unwrap();
+        assert_eq!(
+            due,
+            Due::Ask((0..400).map(|at| (at * 2_000 + 1_000, 1_000)).collect())
+        );
     }
 }

@@ -4,43 +4,51 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::sample::{MAX_SAMPLE_BYTES, Record, SampleMeta};
-use ddx_wire::seal::{Lane, MAX_DATAGRAM_BYTES, Sealer};
-use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
+use ddx_wire::message::{Lacks, NackEntry, ReportEntry};
+use ddx_wire::sample::{MAX_SAMPLE_BYTES, SampleMeta};
+use ddx_wire::seal::{MAX_DATAGRAM_BYTES, Sealer};
+use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 use super::deadlines::Deadlines;
-use super::outbox::Outbox;
-use super::pace::Pace;
-use super::{Due, Path, ReaderHost, Route, SenderEvent, TimerName, Transmit, key};
+use super::path::{Offered, Path, PathLimits};
+use super::{
+    Due, Fetch, PathStatus, ReaderHost, Route, SenderEvent, TimerName, Transmit, Via, group_number,
+    key,
+};
 
 /// Limits of a [`Sender`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SenderConfig {
-    /// Greatest datagram, header and seal included, bytes.
+    /// Greatest datagram until a longer one was seen to arrive, header and seal included, bytes.
     pub datagram_bytes: usize,
+    /// Longest datagram that is tried by unicast, bytes.
+    pub datagram_bytes_max: usize,
     /// Most datagrams in one transmit, at most 64: what one segmented send of the driver's socket takes.
     pub segments_max: usize,
-    /// How long a datagram may wait for company when the driver does not [`Sender::flush`].
-    pub coalesce: Duration,
-    /// Rate over all destinations, bytes per second; `None` leaves pacing to the link.
-    pub pace_bytes_per_second: Option<u64>,
-    /// Most bytes that wait to be sent; samples beyond are dropped and counted, and repaired as last values.
-    pub queue_bytes: usize,
     /// Most streams open at a time.
     pub max_streams: usize,
 }
 
-/// Sends samples to the hosts that read them, each once, and repeats the last one until it is confirmed.
+/// Sends samples to the hosts that read them, each once for each way that they take, as fast as the way allows, and repeats
+/// what was lost.
+///
+/// `P` holds a payload in place: large samples are kept while their fragments leave.
 #[derive(Debug)]
-pub struct Sender {
+pub struct Sender<P> {
     config: SenderConfig,
     sealer: Sealer,
     streams: BTreeMap<StreamId, Stream>,
-    outbox: Outbox,
-    pace: Pace,
+    paths: BTreeMap<SocketAddr, Path<P>>,
+    numbers: BTreeMap<u16, SocketAddr>,
+    last_number: u16,
+    /// Paths that have something to send, in turn.
+    ready: VecDeque<SocketAddr>,
+    /// Paths that wait for their rate.
+    blocked: Deadlines<SocketAddr>,
+    /// Paths that may have something to fetch.
+    hungry: BTreeSet<SocketAddr>,
     round_trips: BTreeMap<Tag, Duration>,
     repeats: Deadlines<StreamId>,
-    events: VecDeque<(StreamId, Tag)>,
     counters: SenderCounters,
     now: Time,
 }
@@ -59,23 +67,28 @@ pub struct SenderCounters {
 /// What a [`Sender`] has done for one stream.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StreamCounters {
-    /// Samples queued for sending, each counted once however many hosts read.
+    /// New samples, each counted once however many hosts read.
     pub sent: u64,
-    /// Copies of a sample that found no room in the queue: the link is slower than the stream.
-    pub queue_dropped: u64,
-    /// Samples over 64 KiB, which are not sent.
+    /// Turns at which a path had no room for a new sample: the link is slower than the stream.
+    pub deferred: u64,
+    /// Samples that were older than the contract allows when their turn came.
+    pub expired: u64,
+    /// Samples over 64 MiB, which are not sent.
     pub too_large: u64,
-    /// Repeats queued: growth beyond one for each new reader means loss.
+    /// Samples sent once more, in full or in part: growth beyond one for each new reader means loss.
     pub repeats: u64,
 }
 
 #[derive(Debug)]
 struct Stream {
-    interval: Duration,
+    contract: Contract,
+    /// Samples of the newest one's epoch that were offered to no path.
+    filtered: u64,
     next_due: Time,
     readers: Vec<Reader>,
     destinations: Vec<SocketAddr>,
     newest: Option<(Epoch, Seq)>,
+    expired: Option<(Epoch, Seq)>,
     counters: StreamCounters,
 }
 
@@ -87,56 +100,89 @@ struct Reader {
     held: Option<(Epoch, Seq)>,
     repeats: u32,
     repeat_asked_at: Option<Time>,
-    /// A [`SenderEvent::Repeat`] for it waits in the queue of events.
-    wanting: bool,
+    /// What it lacked when it last asked, and how often it asked for that.
+    asked: Option<((Epoch, Seq), u32)>,
 }
 
-impl Sender {
+impl<P: AsRef<[u8]> + Clone> Sender<P> {
     /// Makes a sender without streams. `sealer` is the data sealer of this incarnation.
     pub fn new(config: SenderConfig, sealer: Sealer, now: Time) -> Self {
         Self {
-            outbox: Outbox::new(&config),
-            pace: Pace::new(config.pace_bytes_per_second, now),
             config,
             sealer,
             streams: BTreeMap::new(),
+            paths: BTreeMap::new(),
+            numbers: BTreeMap::new(),
+            last_number: FIRST_UNICAST - 1,
+            ready: VecDeque::new(),
+            blocked: Deadlines::new(),
+            hungry: BTreeSet::new(),
             round_trips: BTreeMap::new(),
             repeats: Deadlines::new(),
-            events: VecDeque::new(),
             counters: SenderCounters::default(),
             now,
         }
     }
 
-    /// Opens a stream, and asks for its present value for every reader. An open stream is updated.
+    /// Opens a stream, and asks for its present value for every new reader. An open stream is updated: readers that stay
+    /// keep their state.
     ///
     /// A stream over the limit is not opened, and counted.
-    pub fn open(&mut self, id: StreamId, route: Route, now: Time) {
+    pub fn open(&mut self, id: StreamId, route: &Route, now: Time) {
+        self.now = now;
         if !self.streams.contains_key(&id) && self.streams.len() >= self.config.max_streams {
             self.counters.refused_streams += 1;
             return;
         }
         let stream = self.streams.entry(id).or_insert_with(|| Stream {
-            interval: Duration::ZERO,
+            contract: route.contract,
+            filtered: 0,
             next_due: now,
             readers: Vec::new(),
             destinations: Vec::new(),
             newest: None,
+            expired: None,
             counters: StreamCounters::default(),
         });
+        let before = std::mem::take(&mut stream.destinations);
         stream.reroute(route, now);
-        for reader in &mut stream.readers {
-            if reader.sent.is_none() && reader.repeat_asked_at.is_none() {
-                reader.wanting = true;
+        let contract = stream.contract;
+        let destinations = stream.destinations.clone();
+        let wanting: Vec<SocketAddr> = stream
+            .readers
+            .iter_mut()
+            .filter(|reader| reader.sent.is_none() && reader.repeat_asked_at.is_none())
+            .map(|reader| {
                 reader.repeat_asked_at = Some(now);
-                self.events.push_back((id, reader.host.tag));
+                reader.host.addr
+            })
+            .collect();
+        let newest = stream.newest;
+        let progress = before
+            .iter()
+            .find_map(|to| self.paths.get(to)?.progress(id));
+        for to in &destinations {
+            let path = self.path(*to);
+            path.open(id, contract);
+            if let Some(progress) = progress.filter(|_| !before.contains(to)) {
+                path.follow(id, progress, newest, now);
+                self.hungry.insert(*to);
+                enlist(&mut self.ready, &self.blocked, *to);
             }
         }
-        self.outbox.prune();
+        for to in before.into_iter().filter(|to| !destinations.contains(to)) {
+            if let Some(path) = self.paths.get_mut(&to) {
+                path.rest(id);
+            }
+        }
+        for to in wanting {
+            self.ask_repeat(id, to, None);
+        }
+        self.prune();
     }
 
-    /// Changes an open stream's route; readers that stay keep their state, new ones are sent the present value.
-    pub fn update(&mut self, id: StreamId, route: Route, now: Time) {
+    /// Changes an open stream's route; one that is not open is left alone.
+    pub fn update(&mut self, id: StreamId, route: &Route, now: Time) {
         if self.streams.contains_key(&id) {
             self.open(id, route, now);
         }
@@ -146,10 +192,7 @@ impl Sender {
     pub fn close(&mut self, id: StreamId) {
         self.streams.remove(&id);
         self.repeats.clear(id);
-        self.events.retain(|(stream, _)| *stream != id);
-        let tags: BTreeSet<Tag> = self.streams.values().flat_map(Stream::tags).collect();
-        self.round_trips.retain(|tag, _| tags.contains(tag));
-        self.outbox.prune();
+        self.prune();
     }
 
     /// Tells when the stream's contract admits its next sample. A stream that is not open is due at once.
@@ -160,75 +203,65 @@ impl Sender {
         }
     }
 
-    /// Queues a sample for every reader. One that is not newer than the last is ignored.
+    /// Offers a new sample to every path of its stream. One that is not newer than the last is ignored.
     ///
-    /// The driver keeps the contract by asking [`Sender::due`] first, and counts what it leaves out in `meta.filtered`.
-    /// One over 64 KiB is dropped and counted, and one of a stream that is not open is ignored.
-    pub fn write(&mut self, id: StreamId, meta: &SampleMeta, payload: &[u8], now: Time) {
+    /// A path that is full takes it later, by a [`SenderEvent::Fetch`], or a newer one instead. The driver keeps the
+    /// contract's rate by asking [`Sender::due`] first. One over 64 MiB is dropped and counted, and one of a stream that is
+    /// not open is ignored.
+    pub fn write(&mut self, id: StreamId, meta: &SampleMeta, payload: &P, now: Time) {
         self.now = now;
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
-        if !stream.admits(payload) {
-            return;
-        }
         let newest = Some(key(meta));
-        if newest <= stream.newest {
+        if newest <= stream.newest || !stream.admits(meta, payload.as_ref(), now) {
             return;
         }
-        stream.newest = newest;
+        let meta = &stream.advance(meta);
         stream.counters.sent += 1;
         stream.advance_due(now);
-        let record = record(id, meta, payload, false);
-        let lane = if self.outbox.fragments(payload.len()) {
-            Lane::Bulk
-        } else {
-            Lane::Values
-        };
+        let mut gone = Vec::new();
         for to in &stream.destinations {
-            if self.outbox.push(lane, *to, &record, now).is_err() {
-                stream.counters.queue_dropped += 1;
+            let Some(path) = self.paths.get_mut(to) else {
+                continue;
+            };
+            match path.offer(id, meta, payload, now) {
+                // Large ones are noted again when they have left in full.
+                Offered::Goes | Offered::Begins => gone.push(*to),
+                Offered::Waits => {
+                    stream.counters.deferred += 1;
+                    self.hungry.insert(*to);
+                }
             }
+            enlist(&mut self.ready, &self.blocked, *to);
         }
-        for reader in &mut stream.readers {
-            reader.sent = newest;
-            reader.sent_at = now;
-            reader.repeats = 0;
-            // The value that the reader wanted is on its way.
-            reader.wanting = false;
-        }
-        if !stream.readers.is_empty() {
-            self.repeats.set_if_idle(id, now + REPEAT_FIRST);
+        for to in gone {
+            self.note_sent(id, to, key(meta), false);
         }
     }
 
-    /// Queues the stream's present value for one reader, as [`SenderEvent::Repeat`] asked.
-    /// Ignored if the stream or the reader is gone meanwhile.
-    pub fn repeat(&mut self, id: StreamId, to: Tag, meta: &SampleMeta, payload: &[u8], now: Time) {
+    /// Takes what a [`SenderEvent::Fetch`] asked for, or that the store has nothing like it.
+    pub fn fetched(&mut self, fetch: &Fetch, found: Option<(&SampleMeta, &P)>, now: Time) {
         self.now = now;
-        let Some(stream) = self.streams.get_mut(&id) else {
+        let Some(stream) = self.streams.get_mut(&fetch.stream) else {
             return;
         };
-        if !stream.admits(payload) {
-            return;
+        let found = found.filter(|(meta, payload)| stream.admits(meta, payload.as_ref(), now));
+        let found = found.map(|(meta, payload)| (stream.complete(meta), payload));
+        if found.is_some() && fetch.again {
+            stream.counters.repeats += 1;
         }
-        let Some(reader) = stream.readers.iter_mut().find(|r| r.host.tag == to) else {
+        let newest = stream.newest;
+        let Some(path) = self.paths.get_mut(&fetch.to) else {
             return;
         };
-        let record = record(id, meta, payload, true);
-        stream.counters.repeats += 1;
-        let pushed = self
-            .outbox
-            .push(Lane::Commands, reader.host.addr, &record, now);
-        if pushed.is_err() {
-            stream.counters.queue_dropped += 1;
+        let found = found.as_ref().map(|(meta, payload)| (meta, *payload));
+        let offered = path.fetched(fetch, found, newest, now);
+        self.hungry.insert(fetch.to);
+        enlist(&mut self.ready, &self.blocked, fetch.to);
+        if let (Some(Offered::Goes | Offered::Begins), Some((meta, _))) = (offered, found) {
+            self.note_sent(fetch.stream, fetch.to, key(meta), false);
         }
-        if Some(key(meta)) > reader.sent {
-            reader.sent = Some(key(meta));
-            reader.sent_at = now;
-            reader.repeats = 0;
-        }
-        self.repeats.set_if_idle(id, now + REPEAT_NEXT);
     }
 
     /// Learns what a reader holds, from its confirmation or its renewal.
@@ -238,6 +271,7 @@ impl Sender {
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
+        let newest = stream.newest;
         let Some(reader) = stream.readers.iter_mut().find(|r| r.host.tag == tag) else {
             return;
         };
@@ -246,12 +280,67 @@ impl Sender {
             && reader
                 .repeat_asked_at
                 .is_none_or(|asked| now >= asked + REPEAT_NEXT);
-        if reader.is_behind() && overdue && !reader.wanting {
+        let to = reader.host.addr;
+        if reader.is_behind() && overdue {
             // It is there, perhaps again: one repeat might be lost, or a fragment of it.
             reader.repeats = reader.repeats.min(REPEAT_LIMIT - REPEATS_AGAIN);
-            reader.wanting = true;
             reader.repeat_asked_at = Some(now);
-            self.events.push_back((id, tag));
+            self.ask_repeat(id, to, newest);
+        }
+        self.release(id);
+    }
+
+    /// Takes in how a reader's host receives.
+    pub fn handle_report(&mut self, tag: Tag, report: &ReportEntry, now: Time) {
+        self.now = now;
+        let path = self.numbers.get(&report.path);
+        if let Some(path) = path.and_then(|to| self.paths.get_mut(to)) {
+            path.handle_report(tag, report, now);
+        }
+    }
+
+    /// Takes in what a reader's host lacks.
+    pub fn handle_nack(&mut self, tag: Tag, nack: &NackEntry, now: Time) {
+        self.now = now;
+        let Some(stream) = self.streams.get_mut(&nack.stream) else {
+            return;
+        };
+        let Some(reader) = stream.readers.iter_mut().find(|r| r.host.tag == tag) else {
+            return;
+        };
+        stream.counters.repeats += 1;
+        let at = (nack.epoch, nack.seq);
+        let (contract, is_newest) = (stream.contract, Some(at) >= stream.newest);
+        if reader.asked.is_none_or(|(asked, _)| asked != at) {
+            reader.asked = Some((at, 0));
+        }
+        let times = reader.asked.as_mut().map_or(0, |(_, times)| {
+            *times += 1;
+            *times
+        });
+        let to = match reader.host.via {
+            // Others of the group may lack the same; but perhaps this one does not hear the group any more.
+            Via::Group(group) if times <= GROUP_REPAIRS => group,
+            Via::Group(_) => reader.host.addr,
+            Via::Unicast | Via::Both(_) => reader.host.addr,
+        };
+        let path = self.path(to);
+        path.open(nack.stream, contract);
+        let answered = match &nack.lacks {
+            Lacks::Samples(count) => {
+                path.handle_gap(nack.stream, nack.epoch, nack.seq, *count);
+                true
+            }
+            Lacks::Parts(parts) => path.handle_parts(nack.stream, at, parts, is_newest, now),
+        };
+        self.hungry.insert(to);
+        enlist(&mut self.ready, &self.blocked, to);
+        if answered
+            && let Some(stream) = self.streams.get_mut(&nack.stream)
+            && let Some(reader) = stream.readers.iter_mut().find(|r| r.host.tag == tag)
+        {
+            // It is alive and says itself what it lacks.
+            (reader.sent_at, reader.repeats) = (now, 0);
         }
     }
 
@@ -259,74 +348,75 @@ impl Sender {
     ///
     /// Until told, 50 ms are assumed. Ignored for a host that reads nothing.
     pub fn round_trip(&mut self, tag: Tag, time: Duration) {
-        if self
-            .streams
-            .values()
-            .flat_map(Stream::tags)
-            .any(|t| t == tag)
-        {
-            self.round_trips.insert(tag, time.min(ROUND_TRIP_MAX));
+        let time = time.min(ROUND_TRIP_MAX);
+        let mut readers = self.streams.values().flat_map(|stream| &stream.readers);
+        if let Some(reader) = readers.find(|reader| reader.host.tag == tag) {
+            let to = reader.host.addr;
+            self.round_trips.insert(tag, time);
+            if let Some(path) = self.paths.get_mut(&to) {
+                path.set_round_trip(time);
+            }
         }
     }
 
     /// Lets coalesced datagrams go: the driver has no more samples in hand.
     pub fn flush(&mut self, now: Time) {
         self.now = now;
-        self.outbox.close_all();
+        for to in &self.ready {
+            if let Some(path) = self.paths.get_mut(to) {
+                path.flush(now);
+            }
+        }
     }
 
     /// Does what has come due.
     pub fn handle_timeout(&mut self, now: Time) {
         self.now = now;
-        let waited = self.outbox.open_since().map(|t| t + self.config.coalesce);
-        if waited.is_some_and(|at| at <= now) {
-            self.outbox.close_all();
+        while let Some(to) = self.blocked.pop(now) {
+            if let Some(path) = self.paths.get_mut(&to) {
+                path.flush(now);
+                self.ready.push_back(to);
+                self.hungry.insert(to);
+            }
         }
         while let Some(id) = self.repeats.pop(now) {
             self.ask_repeats(id, now);
         }
     }
 
-    /// Replaces `out` by the next datagrams to send; `None` when there are none, or the pace forbids.
+    /// Replaces `out` by the next datagrams to send; `None` when there are none, or the rates forbid.
     pub fn poll_transmit(&mut self, out: &mut Vec<u8>) -> Option<Transmit> {
-        if self.pace.blocked_until(self.now).is_some() {
-            return None;
+        let to = self.next_path()?;
+        let path = self.paths.get_mut(&to)?;
+        let transmit = path.poll_transmit(&mut self.sealer, out, self.now);
+        let left = path.take_left();
+        self.hungry.insert(to);
+        enlist(&mut self.ready, &self.blocked, to);
+        for (stream, epoch, seq) in left {
+            self.note_sent(stream, to, (epoch, seq), true);
         }
-        let limit = self.pace.batch_bytes();
-        let transmit = self.outbox.pop(&mut self.sealer, limit, out)?;
-        self.pace.spend(out.len(), self.now);
+        let transmit = transmit?;
         let segment = transmit.segment.map_or(out.len(), usize::from);
-        self.counters.datagrams += out.len().div_ceil(segment) as u64;
+        self.counters.datagrams += out.len().div_ceil(segment.max(1)) as u64;
         self.counters.bytes += out.len() as u64;
         Some(transmit)
     }
 
     /// When and why to call [`Sender::handle_timeout`].
     pub fn poll_timeout(&self) -> Option<(Time, TimerName)> {
-        let coalesce = self.outbox.open_since().map(|t| t + self.config.coalesce);
-        let pace = self
-            .outbox
-            .is_ready()
-            .then(|| self.pace.blocked_until(self.now).unwrap_or(self.now));
-        let repeat = self.repeats.first();
-        [
-            coalesce.map(|at| (at, TimerName::Coalesce)),
-            pace.map(|at| (at, TimerName::Pace)),
-            repeat.map(|at| (at, TimerName::Repeat)),
-        ]
-        .into_iter()
-        .flatten()
-        .min_by_key(|(at, _)| *at)
+        let pace = self.blocked.first().map(|at| (at, TimerName::Pace));
+        let repeat = self.repeats.first().map(|at| (at, TimerName::Repeat));
+        pace.into_iter().chain(repeat).min_by_key(|(at, _)| *at)
     }
 
-    /// The next request to the driver.
+    /// The next request to the driver, who answers it by [`Sender::fetched`] before it asks for another.
     pub fn poll_event(&mut self) -> Option<SenderEvent> {
-        while let Some((stream, to)) = self.events.pop_front() {
-            let readers = self.streams.get_mut(&stream).map(|s| &mut s.readers);
-            let reader = readers.and_then(|r| r.iter_mut().find(|r| r.host.tag == to));
-            if reader.is_some_and(|reader| std::mem::take(&mut reader.wanting)) {
-                return Some(SenderEvent::Repeat { stream, to });
-            }
+        while let Some(&to) = self.hungry.first() {
+            let fetch = self.paths.get_mut(&to).and_then(|p| p.poll_fetch(self.now));
+            match fetch {
+                Some(fetch) => return Some(SenderEvent::Fetch(fetch)),
+                None => self.hungry.remove(&to),
+            };
         }
         None
     }
@@ -341,11 +431,138 @@ impl Sender {
         self.streams.get(&id).map(|stream| stream.counters)
     }
 
+    /// What is known of each destination in use.
+    pub fn paths(&self) -> impl Iterator<Item = PathStatus> {
+        self.paths.values().map(Path::status)
+    }
+
+    fn path(&mut self, to: SocketAddr) -> &mut Path<P> {
+        let number = match self.paths.get(&to) {
+            Some(path) => path.number(),
+            None => group_number(to).unwrap_or_else(|| self.unicast_number()),
+        };
+        self.numbers.insert(number, to);
+        self.paths.entry(to).or_insert_with(|| {
+            let limits = PathLimits {
+                // Room for at least one payload byte of a fragment, whatever the configuration says.
+                datagram_bytes: self.config.datagram_bytes.max(DATAGRAM_BYTES_MIN),
+                datagram_bytes_max: self.config.datagram_bytes_max,
+                segments_max: self.config.segments_max.clamp(1, BATCH_SEGMENTS),
+            };
+            let mut path = Path::new(to, number, limits, self.now);
+            let readers = self.streams.values().flat_map(|stream| &stream.readers);
+            let at = readers.filter(|reader| reader.host.addr == to);
+            let known = at.filter_map(|reader| self.round_trips.get(&reader.host.tag));
+            if let Some(time) = known.max() {
+                path.set_round_trip(*time);
+            }
+            path
+        })
+    }
+
+    fn unicast_number(&mut self) -> u16 {
+        loop {
+            self.last_number = self.last_number.checked_add(1).unwrap_or(FIRST_UNICAST);
+            if !self.numbers.contains_key(&self.last_number) {
+                return self.last_number;
+            }
+        }
+    }
+
+    /// The most urgent of the paths whose rate admits something, in turn.
+    fn next_path(&mut self) -> Option<SocketAddr> {
+        let mut best: Option<(usize, usize)> = None;
+        let mut at = 0;
+        while let Some(to) = self.ready.get(at).copied() {
+            let Some(path) = self.paths.get_mut(&to) else {
+                self.ready.remove(at);
+                continue;
+            };
+            let Some(rank) = path.rank() else {
+                // What waits for company stays listed until it is flushed.
+                if path.is_ready() {
+                    at += 1;
+                } else {
+                    self.ready.remove(at);
+                }
+                continue;
+            };
+            if let Some(until) = path.blocked_until(self.now) {
+                self.blocked.set(to, until);
+                self.ready.remove(at);
+                continue;
+            }
+            if best.is_none_or(|(least, _)| rank < least) {
+                best = Some((rank, at));
+            }
+            at += 1;
+        }
+        self.ready.remove(best?.1)
+    }
+
+    /// A sample leaves by a path: its readers there may confirm it. `in_full` tells that the last fragment of a large one
+    /// has left, from when on that can be expected.
+    fn note_sent(&mut self, id: StreamId, to: SocketAddr, at: (Epoch, Seq), in_full: bool) {
+        let now = self.now;
+        let Some(stream) = self.streams.get_mut(&id) else {
+            return;
+        };
+        for reader in &mut stream.readers {
+            if !reader.host.is_reached_by(to) {
+                continue;
+            }
+            if Some(at) > reader.sent {
+                reader.sent = Some(at);
+                (reader.sent_at, reader.repeats) = (now, 0);
+            } else if in_full && Some(at) == reader.sent {
+                reader.sent_at = now;
+            }
+        }
+        if !stream.readers.is_empty() {
+            self.repeats.set_if_idle(id, now + REPEAT_FIRST);
+        }
+    }
+
+    /// Lets go of large samples that every reader holds.
+    fn release(&mut self, id: StreamId) {
+        let Some(stream) = self.streams.get(&id) else {
+            return;
+        };
+        let Some(held) = stream
+            .readers
+            .iter()
+            .map(|reader| reader.held)
+            .min()
+            .flatten()
+        else {
+            return;
+        };
+        let unicast = stream.readers.iter().map(|reader| &reader.host.addr);
+        for to in stream.destinations.iter().chain(unicast) {
+            if let Some(path) = self.paths.get_mut(to) {
+                path.release(id, held);
+            }
+        }
+    }
+
+    fn ask_repeat(&mut self, id: StreamId, to: SocketAddr, newest: Option<(Epoch, Seq)>) {
+        let Some(contract) = self.streams.get(&id).map(|stream| stream.contract) else {
+            return;
+        };
+        let path = self.path(to);
+        path.open(id, contract);
+        path.repeat(id, newest);
+        self.hungry.insert(to);
+        enlist(&mut self.ready, &self.blocked, to);
+    }
+
     fn ask_repeats(&mut self, id: StreamId, now: Time) {
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
+        let newest = stream.newest;
         let mut next: Option<Time> = None;
+        let mut asked = Vec::new();
         for reader in &mut stream.readers {
             if !reader.is_behind() || reader.repeats >= REPEAT_LIMIT {
                 continue;
@@ -360,16 +577,42 @@ impl Sender {
                 reader.repeats += 1;
                 reader.repeat_asked_at = Some(now);
                 at = now + REPEAT_NEXT;
-                if !reader.wanting {
-                    reader.wanting = true;
-                    self.events.push_back((id, reader.host.tag));
-                }
+                asked.push(reader.host.addr);
             }
             next = Some(next.map_or(at, |other| other.min(at)));
         }
         if let Some(at) = next {
             self.repeats.set(id, at);
         }
+        for to in asked {
+            self.ask_repeat(id, to, newest);
+        }
+    }
+
+    /// Drops flows and paths that no stream uses.
+    fn prune(&mut self) {
+        let streams = &self.streams;
+        let tags: BTreeSet<Tag> = streams.values().flat_map(Stream::tags).collect();
+        self.round_trips.retain(|tag, _| tags.contains(tag));
+        let mut used: BTreeMap<SocketAddr, BTreeSet<StreamId>> = BTreeMap::new();
+        for (id, stream) in streams {
+            let unicast = stream.readers.iter().map(|reader| reader.host.addr);
+            for to in stream.destinations.iter().copied().chain(unicast) {
+                used.entry(to).or_default().insert(*id);
+            }
+        }
+        self.paths.retain(|to, path| {
+            let streams = used.get(to);
+            path.keep_readers(&tags);
+            path.keep(|id| streams.is_some_and(|streams| streams.contains(&id)));
+            let kept = streams.is_some() || !path.is_unused();
+            if !kept {
+                self.numbers.remove(&path.number());
+                self.blocked.clear(*to);
+                self.hungry.remove(to);
+            }
+            kept
+        });
     }
 
     fn first_repeat_after(&self, tag: Tag) -> Duration {
@@ -378,42 +621,90 @@ impl Sender {
     }
 }
 
+fn enlist(ready: &mut VecDeque<SocketAddr>, blocked: &Deadlines<SocketAddr>, to: SocketAddr) {
+    if !blocked.contains(&to) && !ready.contains(&to) {
+        ready.push_back(to);
+    }
+}
+
 impl Stream {
-    fn reroute(&mut self, route: Route, now: Time) {
-        self.interval = Duration::from_nanos(route.contract.interval_ns());
-        self.next_due = self.next_due.min(now + self.interval);
+    fn reroute(&mut self, route: &Route, now: Time) {
+        self.contract = route.contract;
+        self.next_due = self.next_due.min(now + self.interval());
         let mut old = std::mem::take(&mut self.readers);
-        for host in route.readers.into_iter().take(MAX_READERS) {
+        for host in route.readers.iter().take(MAX_READERS) {
             let kept = old.iter().position(|reader| reader.host.tag == host.tag);
-            let reader = kept.map_or_else(|| Reader::new(host, now), |at| old.swap_remove(at));
-            self.readers.push(Reader { host, ..reader });
+            let reader = kept.map_or_else(|| Reader::new(*host, now), |at| old.swap_remove(at));
+            self.readers.push(Reader {
+                host: *host,
+                ..reader
+            });
         }
-        let unicast = self.readers.iter().map(|reader| reader.host.addr);
-        let addresses: BTreeSet<SocketAddr> = match route.path {
-            Path::Unicast => unicast.collect(),
-            Path::Multicast(group) => BTreeSet::from([group]),
-            Path::Both(group) => unicast.chain([group]).collect(),
-        };
-        self.destinations = addresses.into_iter().collect();
+        let destinations: BTreeSet<SocketAddr> = self
+            .readers
+            .iter()
+            .flat_map(|reader| reader.host.destinations())
+            .collect();
+        self.destinations = destinations.into_iter().collect();
     }
 
-    /// Tells whether a sample fits the protocol, and counts one that does not.
-    fn admits(&mut self, payload: &[u8]) -> bool {
-        let fits = payload.len() <= MAX_SAMPLE_BYTES;
-        if !fits {
+    /// Tells whether a sample fits the protocol and the contract, and counts one that does not.
+    fn admits(&mut self, meta: &SampleMeta, payload: &[u8], now: Time) -> bool {
+        if payload.len() > MAX_SAMPLE_BYTES {
             self.counters.too_large += 1;
+            return false;
         }
-        fits
+        let max_age = self.contract.max_age_ms;
+        let max_age = max_age.map(|ms| Duration::from_millis(ms.into()));
+        if max_age.is_some_and(|age| now.since(meta.capture) > age) {
+            if self.expired < Some(key(meta)) {
+                self.expired = Some(key(meta));
+                self.counters.expired += 1;
+            }
+            return false;
+        }
+        true
+    }
+
+    /// Takes note of a sample that goes out, and completes it by how many of its epoch were offered to no path.
+    fn advance(&mut self, meta: &SampleMeta) -> SampleMeta {
+        let meta = self.complete(meta);
+        if Some(key(&meta)) > self.newest {
+            self.filtered = meta.filtered;
+            self.newest = Some(key(&meta));
+        }
+        meta
+    }
+
+    /// The same for one that goes out of turn, perhaps before the contract lets it go to all.
+    fn complete(&self, meta: &SampleMeta) -> SampleMeta {
+        let (epoch, Seq(seq)) = key(meta);
+        let filtered = match self.newest {
+            Some((last, Seq(from))) if last == epoch => {
+                let skipped = seq.saturating_sub(from).saturating_sub(1);
+                self.filtered.saturating_add(skipped)
+            }
+            Some(_) | None => seq,
+        };
+        SampleMeta {
+            filtered: filtered.min(seq.saturating_sub(1)),
+            ..*meta
+        }
     }
 
     fn advance_due(&mut self, now: Time) {
+        let interval = self.interval();
         // A source at just the contract's rate may be late once and on time again; more than one interval is no credit.
-        let base = if now.since(self.next_due) < self.interval {
+        let base = if now.since(self.next_due) < interval {
             self.next_due
         } else {
             now
         };
-        self.next_due = base + self.interval;
+        self.next_due = base + interval;
+    }
+
+    fn interval(&self) -> Duration {
+        Duration::from_nanos(self.contract.interval_ns())
     }
 
     fn tags(&self) -> impl Iterator<Item = Tag> + '_ {
@@ -430,7 +721,7 @@ impl Reader {
             held: None,
             repeats: 0,
             repeat_asked_at: None,
-            wanting: false,
+            asked: None,
         }
     }
 
@@ -443,22 +734,10 @@ impl Default for SenderConfig {
     fn default() -> Self {
         Self {
             datagram_bytes: MAX_DATAGRAM_BYTES,
+            datagram_bytes_max: JUMBO_BYTES,
             segments_max: 64,
-            coalesce: Duration::ZERO,
-            pace_bytes_per_second: None,
-            queue_bytes: 4 << 20,
             max_streams: 16_384,
         }
-    }
-}
-
-fn record<'a>(stream: StreamId, meta: &SampleMeta, payload: &'a [u8], repeat: bool) -> Record<'a> {
-    Record {
-        stream,
-        repeat,
-        meta: *meta,
-        fragment: None,
-        payload,
     }
 }
 
@@ -475,5 +754,15 @@ const REPEATS_AGAIN: u32 = 8;
 const ROUND_TRIP_UNKNOWN: Duration = Duration::from_millis(50);
 /// A peer that answers ever more slowly must not put repeats off for ever.
 const ROUND_TRIP_MAX: Duration = Duration::from_secs(1);
+/// What a jumbo frame of 9,000 bytes carries.
+const JUMBO_BYTES: usize = 8_972;
+/// `PROTOCOL.md#limits`: what one segmented send of the kernel takes.
+const BATCH_SEGMENTS: usize = 64;
+/// Shortest limit of a datagram that a configuration may ask for.
+const DATAGRAM_BYTES_MIN: usize = 256;
+/// Requests of one reader for one sample that are answered by its group.
+const GROUP_REPAIRS: u32 = 2;
 /// Reading hosts of one stream.
 const MAX_READERS: usize = 1_024;
+/// Path numbers below are those of groups.
+pub(super) const FIRST_UNICAST: u16 = 32;

@@ -1,10 +1,9 @@
 //! A sender and receivers over a virtual link: what must hold whatever the link does.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 use ddx_wire::seal::{DomainKey, HEADER_BYTES, Lane, Opener, Purpose, Refused, Sealer};
-use ddx_wire::{HostId, Incarnation};
+use ddx_wire::{Delivery, HostId, Incarnation, Priority};
 use proptest::prelude::*;
 
 use super::*;
@@ -38,22 +37,34 @@ fn group() -> SocketAddr {
     SocketAddr::from(([239, 1, 2, 3], 9))
 }
 
-fn route(path: Path, readers: u16) -> Route {
-    let reader = |n: u16| ReaderHost {
+fn reader(n: u16, via: Via) -> ReaderHost {
+    ReaderHost {
         tag: Tag(READER.0 + u64::from(n)),
         addr: address(n),
-    };
-    Route {
-        contract: Contract::default(),
-        readers: (0..readers).map(reader).collect(),
-        path,
+        via,
     }
 }
 
-fn sender(path: Path, readers: u16) -> Sender {
+fn route(via: Via, readers: u16) -> Route {
+    Route {
+        contract: Contract::default(),
+        readers: (0..readers).map(|n| reader(n, via)).collect(),
+    }
+}
+
+fn every() -> Contract {
+    Contract {
+        delivery: Delivery::Every,
+        ..Contract::default()
+    }
+}
+
+fn sender(via: Via, readers: u16) -> Sender<Vec<u8>> {
     let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
-    sender.open(STREAM, route(path, readers), Time(0));
-    while sender.poll_event().is_some() {}
+    sender.open(STREAM, &route(via, readers), Time(0));
+    while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+        sender.fetched(&fetch, None, Time(0));
+    }
     sender
 }
 
@@ -61,7 +72,7 @@ fn receiver() -> Receiver {
     let mut receiver = Receiver::new(ReceiverConfig::new(READER, domain().id()));
     let opener = Opener::new(&domain(), HOST, LIFE, Purpose::Data);
     receiver.session(sender_tag(), opener);
-    receiver.listen(sender_tag(), STREAM, Time(0));
+    receiver.listen(sender_tag(), STREAM, &Contract::default(), Time(0));
     receiver
 }
 
@@ -81,7 +92,7 @@ fn payload(epoch: u64, seq: u64, len: usize) -> Vec<u8> {
 }
 
 /// Everything the sender has to send, as (destination, datagram).
-fn drain(sender: &mut Sender) -> Vec<(SocketAddr, Vec<u8>)> {
+fn drain(sender: &mut Sender<Vec<u8>>) -> Vec<(SocketAddr, Vec<u8>)> {
     let mut buffer = Vec::new();
     let mut datagrams = Vec::new();
     while let Some(transmit) = sender.poll_transmit(&mut buffer) {
@@ -92,11 +103,18 @@ fn drain(sender: &mut Sender) -> Vec<(SocketAddr, Vec<u8>)> {
     datagrams
 }
 
-fn write(sender: &mut Sender, seq: u64, len: usize, now: Time) -> Vec<Vec<u8>> {
+fn write(sender: &mut Sender<Vec<u8>>, seq: u64, len: usize, now: Time) -> Vec<Vec<u8>> {
     let payload = payload(1, seq, len);
     sender.write(STREAM, &meta(1, seq), &payload, now);
     sender.flush(now);
-    drain(sender).into_iter().map(|(_, bytes)| bytes).collect()
+    let mut datagrams = drain(sender);
+    while let Some((at, TimerName::Pace)) = sender.poll_timeout() {
+        sender.handle_timeout(at);
+        datagrams.extend(drain(sender));
+    }
+    let bytes = datagrams.into_iter().map(|(_, bytes)| bytes);
+    // The link of these tests is one for short datagrams.
+    bytes.filter(|datagram| datagram.len() <= 1_200).collect()
 }
 
 fn feed(receiver: &mut Receiver, datagrams: &[Vec<u8>], now: Time) -> Vec<(Epoch, Seq, usize)> {
@@ -112,140 +130,37 @@ fn feed(receiver: &mut Receiver, datagrams: &[Vec<u8>], now: Time) -> Vec<(Epoch
 
 #[test]
 fn samples_of_one_destination_share_a_datagram() {
-    let mut sender = sender(Path::Unicast, 1);
-    for seq in 1..=30 {
-        sender.write(STREAM, &meta(1, seq), &[0; 64], Time(0));
+    let mut sender = sender(Via::Unicast, 1);
+    for seq in 1..=20 {
+        sender.write(STREAM, &meta(1, seq), &vec![0; 64], Time(0));
     }
     sender.flush(Time(0));
     let mut buffer = Vec::new();
     let transmit = sender.poll_transmit(&mut buffer).unwrap();
-    // 10 records of 112 bytes fit 1,200 with the overhead of 40, so 30 are three equal datagrams in one batch.
-    assert_eq!(transmit.segment, Some(1_160));
-    assert_eq!(buffer.len(), 3 * 1_160);
+    // 10 records of 112 bytes fit 1,200 with the overhead of 52, so 20 are two equal datagrams in one batch.
+    assert_eq!(transmit.segment, Some(1_172));
+    assert_eq!(buffer.len(), 2 * 1_172);
     assert_eq!(sender.poll_transmit(&mut buffer), None);
-    assert_eq!(sender.counters().datagrams, 3);
-}
-
-#[test]
-fn batch_keeps_to_the_segments_that_the_socket_takes() {
-    let config = SenderConfig {
-        segments_max: 1,
-        ..SenderConfig::default()
-    };
-    let mut sender = Sender::new(config, data_sealer(), Time(0));
-    sender.open(STREAM, route(Path::Unicast, 1), Time(0));
-    sender.write(STREAM, &meta(1, 1), &[0; 5_000], Time(0));
-    let mut buffer = Vec::new();
-    let mut transmits = 0;
-    while let Some(transmit) = sender.poll_transmit(&mut buffer) {
-        assert_eq!(transmit.segment, None);
-        transmits += 1;
-    }
-    assert_eq!(transmits, 5);
-}
-
-#[test]
-fn nothing_leaves_before_flush_or_the_coalescing_time() {
-    let config = SenderConfig {
-        coalesce: MS,
-        ..SenderConfig::default()
-    };
-    let mut sender = Sender::new(config, data_sealer(), Time(0));
-    sender.open(STREAM, route(Path::Unicast, 1), Time(0));
-    sender.write(STREAM, &meta(1, 1), b"x", Time(5));
-    assert!(drain(&mut sender).is_empty());
-    let due = Time(5) + MS;
-    assert_eq!(sender.poll_timeout(), Some((due, TimerName::Coalesce)));
-    sender.handle_timeout(due);
-    assert_eq!(drain(&mut sender).len(), 1);
-}
-
-#[test]
-fn each_path_sends_its_copies() {
-    for (path, expected) in [
-        (Path::Unicast, vec![address(0), address(1)]),
-        (Path::Multicast(group()), vec![group()]),
-        (Path::Both(group()), vec![address(0), address(1), group()]),
-    ] {
-        let mut sender = sender(path, 2);
-        sender.write(STREAM, &meta(1, 1), b"x", Time(0));
-        sender.flush(Time(0));
-        let to: Vec<_> = drain(&mut sender).into_iter().map(|(to, _)| to).collect();
-        assert_eq!(to, expected);
-    }
-}
-
-#[test]
-fn second_copy_is_dropped_and_counted() {
-    let mut sender = sender(Path::Both(group()), 1);
-    let mut receiver = receiver();
-    for len in [10, 5_000] {
-        let datagrams = write(&mut sender, len as u64, len, Time(0));
-        assert_eq!(feed(&mut receiver, &datagrams, Time(0)).len(), 1);
-    }
-    let books = receiver.books(sender_tag(), STREAM).unwrap();
-    assert_eq!(books.delivered, 2);
-    assert!(books.duplicates > 0);
-    assert!(books.balanced());
-}
-
-#[test]
-fn streams_that_share_a_datagram_all_arrive() {
-    let mut sender = sender(Path::Unicast, 1);
-    let mut receiver = receiver();
-    let other = StreamId(STREAM.0 + 1);
-    let route = route(Path::Unicast, 1);
-    sender.open(other, route, Time(0));
-    receiver.listen(sender_tag(), other, Time(0));
-    for stream in [STREAM, other] {
-        let payload = payload(1, 1, 10);
-        sender.write(stream, &meta(1, 1), &payload, Time(0));
-    }
-    // The values that the new stream's readers were to be sent are on their way.
-    assert_eq!(sender.poll_event(), None);
-    sender.flush(Time(0));
-    let datagrams: Vec<_> = drain(&mut sender).into_iter().map(|(_, d)| d).collect();
-    assert_eq!(datagrams.len(), 1);
-    assert_eq!(feed(&mut receiver, &datagrams, Time(0)).len(), 2);
-}
-
-#[test]
-fn sample_written_twice_is_sent_once() {
-    let mut sender = sender(Path::Unicast, 1);
-    assert_eq!(write(&mut sender, 2, 10, Time(0)).len(), 1);
-    for seq in [2, 1] {
-        assert_eq!(write(&mut sender, seq, 10, Time(0)).len(), 0);
-    }
-}
-
-#[test]
-fn what_is_held_of_a_stream_that_is_never_quiet_is_told_twice_a_second() {
-    let mut sender = sender(Path::Unicast, 1);
-    let mut receiver = receiver();
-    let mut told = Vec::new();
-    for seq in 1..=200 {
-        let now = Time(0) + 10 * MS * u32::try_from(seq).unwrap();
-        let datagrams = write(&mut sender, seq, 10, now);
-        feed(&mut receiver, &datagrams, now);
-        receiver.handle_timeout(now);
-        told.extend(std::iter::from_fn(|| receiver.poll_event()));
-    }
-    let flows = |event: &ReceiverEvent| matches!(event, ReceiverEvent::Flows { .. });
-    assert!(told.iter().all(flows), "{told:?}");
-    assert!((3..=4).contains(&told.len()), "{told:?}");
+    assert_eq!(sender.counters().datagrams, 2);
 }
 
 #[test]
 fn repeat_is_confirmed_at_once_even_when_held_already() {
-    let mut sender = sender(Path::Unicast, 1);
+    let mut sender = sender(Via::Unicast, 1);
     let mut receiver = receiver();
     let datagrams = write(&mut sender, 1, 10, Time(0));
     feed(&mut receiver, &datagrams, Time(0));
     assert_eq!(receiver.poll_event(), None);
-    sender.repeat(STREAM, READER, &meta(1, 1), &payload(1, 1, 10), Time(0));
-    sender.flush(Time(0));
+    let later = Time(0) + 300 * MS;
+    sender.handle_timeout(later);
+    let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() else {
+        panic!("an unconfirmed value is not repeated");
+    };
+    assert_eq!((fetch.want, fetch.again), (Want::Newest, true));
+    sender.fetched(&fetch, Some((&meta(1, 1), &payload(1, 1, 10))), later);
+    sender.flush(later);
     let repeats: Vec<_> = drain(&mut sender).into_iter().map(|(_, d)| d).collect();
-    assert!(feed(&mut receiver, &repeats, Time(0)).is_empty());
+    assert!(feed(&mut receiver, &repeats, later).is_empty());
     let quiet = ReceiverEvent::Quiet {
         tag: sender_tag(),
         stream: STREAM,
@@ -257,83 +172,15 @@ fn repeat_is_confirmed_at_once_even_when_held_already() {
 }
 
 #[test]
-fn large_sample_is_fragmented_and_batched() {
-    let mut sender = sender(Path::Unicast, 1);
-    let mut receiver = receiver();
-    let datagrams = write(&mut sender, 1, 65_536, Time(0));
-    assert_eq!(datagrams.len(), 65_536_usize.div_ceil(1_104));
-    assert!(datagrams.iter().all(|d| d.len() <= 1_200));
-    let got = feed(&mut receiver, &datagrams, Time(0));
-    assert_eq!(got, [(Epoch(1), Seq(1), 65_536)]);
-    sender.write(STREAM, &meta(1, 2), &[0; 65_537], Time(0));
-    sender.flush(Time(0));
-    assert!(drain(&mut sender).is_empty());
-    assert_eq!(sender.stream_counters(STREAM).unwrap().too_large, 1);
-}
-
-#[test]
-fn repairs_leave_before_values_and_values_before_bulk() {
-    let mut sender = sender(Path::Unicast, 1);
-    for (seq, len) in [(1, 5_000), (2, 10)] {
-        sender.write(STREAM, &meta(1, seq), &vec![0; len], Time(0));
-    }
-    sender.repeat(STREAM, READER, &meta(1, 2), b"x", Time(0));
-    sender.flush(Time(0));
-    let lanes: Vec<_> = drain(&mut sender).iter().map(|(_, d)| d[1]).collect();
-    let [commands, values, bulk] = [Lane::Commands, Lane::Values, Lane::Bulk].map(Lane::to_byte);
-    assert_eq!(lanes[..3], [commands, values, bulk]);
-}
-
-#[test]
-fn contract_is_kept_at_the_source() {
-    let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
-    let mut route = route(Path::Unicast, 1);
-    route.contract = Contract::at_most_hz(10.0).unwrap();
-    sender.open(STREAM, route, Time(0));
-    let mut sent = 0;
-    for seq in 1..=1_000 {
-        let now = Time(0) + MS * u32::try_from(seq).unwrap();
-        if sender.due(STREAM, now) == Due::Now {
-            sender.write(STREAM, &meta(1, seq), b"x", now);
-            sent += 1;
-        }
-    }
-    // The first at once, then ten a second.
-    assert_eq!(sent, 11);
-    assert!(matches!(sender.due(STREAM, Time(0)), Due::At(_)));
-}
-
-#[test]
-fn queue_over_budget_drops_and_counts() {
-    let config = SenderConfig {
-        queue_bytes: 10_000,
-        ..SenderConfig::default()
-    };
-    let mut sender = Sender::new(config, data_sealer(), Time(0));
-    sender.open(STREAM, route(Path::Unicast, 1), Time(0));
-    for seq in 1..=3 {
-        let payload = vec![0; 5_000];
-        sender.write(STREAM, &meta(1, seq), &payload, Time(0));
-    }
-    assert_eq!(sender.stream_counters(STREAM).unwrap().queue_dropped, 2);
-    drain(&mut sender);
-    let payload = vec![0; 5_000];
-    sender.write(STREAM, &meta(1, 4), &payload, Time(0));
-    assert_eq!(sender.stream_counters(STREAM).unwrap().queue_dropped, 2);
-}
-
-#[test]
 fn new_reader_is_sent_the_present_value_once() {
-    let mut sender = sender(Path::Multicast(group()), 1);
-    sender.update(STREAM, route(Path::Multicast(group()), 2), Time(0));
-    let to = Tag(READER.0 + 1);
-    let stream = STREAM;
-    assert_eq!(
-        sender.poll_event(),
-        Some(SenderEvent::Repeat { stream, to })
-    );
+    let mut sender = sender(Via::Group(group()), 1);
+    sender.update(STREAM, &route(Via::Group(group()), 2), Time(0));
+    let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() else {
+        panic!("the new reader gets nothing");
+    };
+    assert_eq!((fetch.to, fetch.want), (address(1), Want::Newest));
+    sender.fetched(&fetch, Some((&meta(1, 9), &b"x".to_vec())), Time(0));
     assert_eq!(sender.poll_event(), None);
-    sender.repeat(STREAM, to, &meta(1, 9), b"x", Time(0));
     sender.flush(Time(0));
     let destinations: Vec<_> = drain(&mut sender).into_iter().map(|(to, _)| to).collect();
     assert_eq!(destinations, [address(1)]);
@@ -341,12 +188,12 @@ fn new_reader_is_sent_the_present_value_once() {
 
 #[test]
 fn unconfirmed_value_is_repeated_fifteen_times_then_at_each_renewal() {
-    let mut sender = sender(Path::Unicast, 1);
+    let mut sender = sender(Via::Unicast, 1);
     write(&mut sender, 1, 10, Time(0));
     let mut asked = Vec::new();
     while let Some((at, _)) = sender.poll_timeout() {
         sender.handle_timeout(at);
-        while sender.poll_event().is_some() {
+        while let Some(SenderEvent::Fetch(_)) = sender.poll_event() {
             asked.push(at);
         }
     }
@@ -362,8 +209,325 @@ fn unconfirmed_value_is_repeated_fifteen_times_then_at_each_renewal() {
 }
 
 #[test]
+fn a_sample_over_the_limit_is_counted_and_a_large_one_leaves_at_the_rate() {
+    let mut sender = sender(Via::Unicast, 1);
+    sender.write(STREAM, &meta(1, 1), &vec![0; (64 << 20) + 1], Time(0));
+    assert_eq!(sender.stream_counters(STREAM).unwrap().too_large, 1);
+    let mut receiver = receiver();
+    sender.write(STREAM, &meta(1, 2), &payload(1, 2, 1 << 20), Time(0));
+    let (mut now, mut got, mut bytes) = (Time(0), Vec::new(), 0);
+    while got.is_empty() {
+        for (_, datagram) in drain(&mut sender) {
+            bytes += datagram.len();
+            if datagram.len() <= 1_200 {
+                got.extend(feed(&mut receiver, &[datagram], now));
+            }
+        }
+        if got.is_empty() {
+            now = sender.poll_timeout().unwrap().0.max(now);
+            sender.handle_timeout(now);
+        }
+    }
+    assert_eq!(got, [(Epoch(1), Seq(2), 1 << 20)]);
+    // 12.5 MB/s until more is known.
+    let took = now.since(Time(0)).as_secs_f64();
+    let expected = bytes as f64 / 12.5e6;
+    assert!(
+        (0.95..1.05).contains(&(took / expected)),
+        "{took} {expected}"
+    );
+}
+
+#[test]
+fn repairs_and_commands_leave_before_values_and_values_before_bulk() {
+    let mut sender = sender(Via::Unicast, 1);
+    let command = StreamId(STREAM.0 + 1);
+    let mut urgent = route(Via::Unicast, 1);
+    urgent.contract.priority = Priority::Command;
+    sender.open(command, &urgent, Time(0));
+    for (stream, seq, len) in [(STREAM, 1, 5_000), (STREAM, 2, 10), (command, 1, 10)] {
+        sender.write(stream, &meta(1, seq), &vec![0; len], Time(0));
+    }
+    sender.flush(Time(0));
+    let mut lanes = Vec::new();
+    while lanes.len() < 4 {
+        lanes.extend(
+            drain(&mut sender)
+                .iter()
+                .filter(|(_, d)| d.len() <= 1_200)
+                .map(|(_, d)| d[1]),
+        );
+        let now = sender.poll_timeout().unwrap().0;
+        sender.handle_timeout(now);
+    }
+    let [commands, values, bulk] = [Lane::Commands, Lane::Values, Lane::Bulk].map(Lane::to_byte);
+    let first = lanes.iter().position(|lane| *lane == commands).unwrap();
+    let value = lanes.iter().position(|lane| *lane == values).unwrap();
+    assert!(
+        first < value && lanes[value + 1..].contains(&bulk),
+        "{lanes:?}"
+    );
+}
+
+#[test]
+fn a_full_path_takes_the_newest_when_it_has_room() {
+    let mut sender = sender(Via::Unicast, 1);
+    // More than waits for a path of 12.5 MB/s: what does not fit stays in the store.
+    for seq in 1..=100 {
+        sender.write(STREAM, &meta(1, seq), &vec![0; 1_000], Time(0));
+    }
+    let counters = sender.stream_counters(STREAM).unwrap();
+    assert!(counters.deferred > 0, "{counters:?}");
+    let mut now = Time(0);
+    let mut fetched = Vec::new();
+    while fetched.is_empty() && now < Time(0) + 100 * MS {
+        sender.flush(now);
+        drain(&mut sender);
+        while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+            fetched.push(fetch.want);
+            sender.fetched(&fetch, Some((&meta(1, 100), &vec![0; 1_000])), now);
+        }
+        if let Some((at, _)) = sender.poll_timeout() {
+            now = at.max(now);
+        }
+        sender.handle_timeout(now);
+    }
+    // A burst goes out in order as long as the ring has it.
+    assert!(
+        matches!(fetched.as_slice(), [Want::After(_, Seq(40..60))]),
+        "{fetched:?}"
+    );
+}
+
+#[test]
+fn what_is_too_old_is_not_sent() {
+    let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
+    let mut route = route(Via::Unicast, 1);
+    route.contract.max_age_ms = Some(10);
+    sender.open(STREAM, &route, Time(0));
+    let fresh = SampleMeta {
+        capture: Time(0) + 100 * MS,
+        ..meta(1, 1)
+    };
+    sender.write(STREAM, &fresh, &vec![0; 8], Time(0) + 105 * MS);
+    let stale = SampleMeta {
+        seq: Seq(2),
+        ..fresh
+    };
+    sender.write(STREAM, &stale, &vec![0; 8], Time(0) + 111 * MS);
+    let counters = sender.stream_counters(STREAM).unwrap();
+    assert_eq!((counters.sent, counters.expired), (1, 1));
+}
+
+#[test]
+fn two_readers_of_unlike_paths_do_not_disturb_one_another() {
+    // One path is cut: nothing of it is ever reported. The other gets each sample all the same.
+    let mut sender = sender(Via::Unicast, 2);
+    let mut now = Time(0);
+    let mut sent = [0; 2];
+    let mut report = ReportEntry {
+        path: 32,
+        highest: 0,
+        received: 0,
+        bytes: 0,
+        delay_us: 0,
+        at_us: 0,
+        longest: 1_200,
+    };
+    for seq in 1..=2_000 {
+        now = now + 5 * MS;
+        sender.handle_timeout(now);
+        sender.write(STREAM, &meta(1, seq), &vec![0; 1_000], now);
+        sender.flush(now);
+        while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+            sender.fetched(&fetch, Some((&meta(1, seq), &vec![0; 1_000])), now);
+        }
+        for (to, datagram) in drain(&mut sender) {
+            let at = usize::from(to == address(1));
+            sent[at] += 1;
+            if at == 0 {
+                report.highest += 1;
+                report.received += 1;
+                report.bytes += u32::try_from(datagram.len()).unwrap();
+                report.at_us = u32::try_from(now.0 / 1_000).unwrap();
+            }
+        }
+        if seq % 20 == 0 {
+            sender.handle_report(READER, &report, now);
+        }
+    }
+    assert!(sent[0] >= 2_000, "{sent:?}");
+    let silent = sender.paths().find(|path| path.to == address(1)).unwrap();
+    assert!(silent.bytes_per_second <= 60_000, "{silent:?}");
+}
+
+#[test]
+fn every_sample_that_the_ring_holds_arrives_in_order() {
+    let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
+    let mut route = route(Via::Unicast, 1);
+    route.contract = every();
+    sender.open(STREAM, &route, Time(0));
+    let mut receiver = receiver();
+    receiver.forget(sender_tag(), STREAM);
+    receiver.listen(sender_tag(), STREAM, &every(), Time(0));
+    while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+        sender.fetched(&fetch, None, Time(0));
+    }
+    let (mut now, mut got, mut count) = (Time(0), Vec::new(), 0);
+    let ring = 1..=40_u64;
+    let mut written = 0;
+    while now < Time(0) + 3_000 * MS {
+        now = now + MS;
+        sender.handle_timeout(now);
+        receiver.handle_timeout(now);
+        if written < 40 {
+            written += 1;
+            let len = if written % 7 == 0 { 4_000 } else { 100 };
+            sender.write(STREAM, &meta(1, written), &payload(1, written, len), now);
+        }
+        sender.flush(now);
+        while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+            // Samples 10 to 12 have left the ring.
+            let from = match fetch.want {
+                Want::Newest => written,
+                Want::After(_, seq) => seq.0 + 1,
+                Want::At(_, seq) => seq.0,
+            };
+            let from = if (10..=12).contains(&from) { 13 } else { from };
+            let len = if from % 7 == 0 { 4_000 } else { 100 };
+            let found = (meta(1, from), payload(1, from, len));
+            let found = ring.contains(&from).then_some((&found.0, &found.1));
+            sender.fetched(&fetch, found, now);
+        }
+        for (_, mut datagram) in drain(&mut sender) {
+            count += 1;
+            // Every third is lost, and all of the three that leave the ring are.
+            if datagram.len() <= 1_200 && count % 3 != 0 && !(10..=12).contains(&written) {
+                receiver.handle_datagram(&mut datagram, false, now);
+            }
+        }
+        while let Some(sample) = receiver.poll_sample() {
+            got.push(sample.meta.seq.0);
+        }
+        while let Some(event) = receiver.poll_event() {
+            match event {
+                ReceiverEvent::Nack(_, nack) => sender.handle_nack(READER, &nack, now),
+                ReceiverEvent::Quiet { epoch, seq, .. }
+                | ReceiverEvent::Flows { epoch, seq, .. } => {
+                    sender.held(STREAM, READER, epoch, seq, now);
+                }
+                ReceiverEvent::OnGroup { .. } | ReceiverEvent::Report(..) => {}
+            }
+        }
+    }
+    let first = got[0];
+    let expected: Vec<u64> = (first..=40)
+        .filter(|seq| !(10..=12).contains(seq))
+        .collect();
+    assert_eq!(got, expected);
+    let books = receiver.books(sender_tag(), STREAM).unwrap();
+    assert_eq!((books.overwritten, books.link_lost), (3, 0), "{books:?}");
+    assert!(books.balanced());
+}
+
+#[test]
+fn each_path_sends_its_copies() {
+    for (via, expected) in [
+        (Via::Unicast, vec![address(0), address(1)]),
+        (Via::Group(group()), vec![group()]),
+        (Via::Both(group()), vec![address(0), address(1), group()]),
+    ] {
+        let mut sender = sender(via, 2);
+        sender.write(STREAM, &meta(1, 1), &b"x".to_vec(), Time(0));
+        sender.flush(Time(0));
+        let to: Vec<_> = drain(&mut sender).into_iter().map(|(to, _)| to).collect();
+        assert_eq!(to, expected);
+    }
+}
+
+#[test]
+fn second_copy_is_dropped_and_counted() {
+    let mut sender = sender(Via::Both(group()), 1);
+    let mut receiver = receiver();
+    for len in [10, 5_000] {
+        let datagrams = write(&mut sender, len as u64, len, Time(0));
+        assert_eq!(feed(&mut receiver, &datagrams, Time(0)).len(), 1);
+    }
+    let books = receiver.books(sender_tag(), STREAM).unwrap();
+    assert_eq!(books.delivered, 2);
+    assert!(books.duplicates > 0);
+    assert!(books.balanced());
+}
+
+#[test]
+fn streams_that_share_a_datagram_all_arrive() {
+    let mut sender = sender(Via::Unicast, 1);
+    let mut receiver = receiver();
+    let other = StreamId(STREAM.0 + 1);
+    let route = route(Via::Unicast, 1);
+    sender.open(other, &route, Time(0));
+    receiver.listen(sender_tag(), other, &Contract::default(), Time(0));
+    for stream in [STREAM, other] {
+        let payload = payload(1, 1, 10);
+        sender.write(stream, &meta(1, 1), &payload, Time(0));
+    }
+    // The values that the new stream's readers were to be sent are on their way.
+    assert_eq!(sender.poll_event(), None);
+    sender.flush(Time(0));
+    let datagrams: Vec<_> = drain(&mut sender).into_iter().map(|(_, d)| d).collect();
+    assert_eq!(datagrams.len(), 1);
+    assert_eq!(feed(&mut receiver, &datagrams, Time(0)).len(), 2);
+}
+
+#[test]
+fn sample_written_twice_is_sent_once() {
+    let mut sender = sender(Via::Unicast, 1);
+    assert_eq!(write(&mut sender, 2, 10, Time(0)).len(), 1);
+    for seq in [2, 1] {
+        assert_eq!(write(&mut sender, seq, 10, Time(0)).len(), 0);
+    }
+}
+
+#[test]
+fn what_is_held_of_a_stream_that_is_never_quiet_is_told_twice_a_second() {
+    let mut sender = sender(Via::Unicast, 1);
+    let mut receiver = receiver();
+    let mut told = Vec::new();
+    for seq in 1..=200 {
+        let now = Time(0) + 10 * MS * u32::try_from(seq).unwrap();
+        let datagrams = write(&mut sender, seq, 10, now);
+        feed(&mut receiver, &datagrams, now);
+        receiver.handle_timeout(now);
+        told.extend(std::iter::from_fn(|| receiver.poll_event()));
+    }
+    told.retain(|event| !matches!(event, ReceiverEvent::Report(..)));
+    let flows = |event: &ReceiverEvent| matches!(event, ReceiverEvent::Flows { .. });
+    assert!(told.iter().all(flows), "{told:?}");
+    assert!((3..=4).contains(&told.len()), "{told:?}");
+}
+
+#[test]
+fn contract_is_kept_at_the_source() {
+    let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
+    let mut route = route(Via::Unicast, 1);
+    route.contract = Contract::at_most_hz(10.0).unwrap();
+    sender.open(STREAM, &route, Time(0));
+    let mut sent = 0;
+    for seq in 1..=1_000 {
+        let now = Time(0) + MS * u32::try_from(seq).unwrap();
+        if sender.due(STREAM, now) == Due::Now {
+            sender.write(STREAM, &meta(1, seq), &b"x".to_vec(), now);
+            sent += 1;
+        }
+    }
+    // The first at once, then ten a second.
+    assert_eq!(sent, 11);
+    assert!(matches!(sender.due(STREAM, Time(0)), Due::At(_)));
+}
+
+#[test]
 fn only_the_senders_datagrams_are_opened() {
-    let mut sender = sender(Path::Unicast, 1);
+    let mut sender = sender(Via::Unicast, 1);
     let datagram = write(&mut sender, 1, 10, Time(0)).remove(0);
     let reason = |config: ReceiverConfig, session: bool, expect: bool| {
         let mut receiver = Receiver::new(config);
@@ -372,7 +536,7 @@ fn only_the_senders_datagrams_are_opened() {
             receiver.session(sender_tag(), opener);
         }
         if expect {
-            receiver.listen(sender_tag(), STREAM, Time(0));
+            receiver.listen(sender_tag(), STREAM, &Contract::default(), Time(0));
         }
         receiver.handle_datagram(&mut datagram.clone(), false, Time(0));
         let refused = receiver.counters().refused;
@@ -396,7 +560,7 @@ fn only_the_senders_datagrams_are_opened() {
 
 #[test]
 fn a_value_that_overtakes_the_grant_is_delivered_with_it() {
-    let mut sender = sender(Path::Unicast, 1);
+    let mut sender = sender(Via::Unicast, 1);
     let mut datagram = write(&mut sender, 1, 10, Time(0)).remove(0);
     let mut receiver = Receiver::new(ReceiverConfig::new(READER, domain().id()));
     let opener = Opener::new(&domain(), HOST, LIFE, Purpose::Data);
@@ -404,7 +568,7 @@ fn a_value_that_overtakes_the_grant_is_delivered_with_it() {
     let mut by_group = datagram.clone();
     receiver.handle_datagram(&mut datagram, false, Time(0));
     assert_eq!(receiver.poll_sample(), None);
-    receiver.listen(sender_tag(), STREAM, Time(0) + MS);
+    receiver.listen(sender_tag(), STREAM, &Contract::default(), Time(0) + MS);
     assert_eq!(receiver.poll_sample().map(|s| s.meta.seq), Some(Seq(1)));
     assert_eq!(receiver.counters().unwanted_records, 0);
     // A group carries the streams of others: what nobody here reads is not even opened.
@@ -435,48 +599,18 @@ fn tables_of_streams_are_bounded() {
     };
     let mut receiver = Receiver::new(config);
     for stream in [1, 1, 2] {
-        receiver.listen(Tag(1), StreamId(stream), Time(0));
+        receiver.listen(Tag(1), StreamId(stream), &Contract::default(), Time(0));
     }
     assert_eq!(receiver.counters().refused_streams, 1);
     let config = SenderConfig {
         max_streams: 1,
         ..SenderConfig::default()
     };
-    let mut sender = Sender::new(config, data_sealer(), Time(0));
+    let mut sender = Sender::<Vec<u8>>::new(config, data_sealer(), Time(0));
     for stream in [1, 1, 2] {
-        sender.open(StreamId(stream), route(Path::Unicast, 1), Time(0));
+        sender.open(StreamId(stream), &route(Via::Unicast, 1), Time(0));
     }
     assert_eq!(sender.counters().refused_streams, 1);
-}
-
-#[test]
-fn paced_sender_keeps_its_rate() {
-    let config = SenderConfig {
-        pace_bytes_per_second: Some(1_200_000),
-        ..SenderConfig::default()
-    };
-    let mut sender = Sender::new(config, data_sealer(), Time(0));
-    sender.open(STREAM, route(Path::Unicast, 1), Time(0));
-    let payload = vec![0; 60_000];
-    sender.write(STREAM, &meta(1, 1), &payload, Time(0));
-    let mut bytes = 0;
-    let mut buffer = Vec::new();
-    let mut now = Time(0);
-    while bytes < 60_000 {
-        while sender.poll_transmit(&mut buffer).is_some() {
-            assert!(
-                buffer.len() <= 1_200,
-                "a batch is one datagram at this rate"
-            );
-            bytes += buffer.len();
-        }
-        now = sender.poll_timeout().unwrap().0.max(now);
-        sender.handle_timeout(now);
-    }
-    assert!(
-        (48..=56).contains(&now.since(Time(0)).as_millis()),
-        "{now:?}"
-    );
 }
 
 /// What a link does to one datagram.
@@ -498,21 +632,21 @@ fn fate(loss_percent: u8, spread_us: u64) -> impl Strategy<Value = Fate> {
 /// One sender and one receiver over a link that follows `fates` in turn, in virtual time.
 struct World {
     now: Time,
-    sender: Sender,
+    sender: Sender<Vec<u8>>,
     receiver: Receiver,
     fates: Vec<Fate>,
     sent: usize,
     flying: BTreeMap<(Time, usize), Vec<u8>>,
-    acks: BTreeMap<(Time, usize), (Epoch, Seq)>,
+    acks: BTreeMap<(Time, usize), ReceiverEvent>,
     present: (u64, u64, usize),
     got: Vec<(Epoch, Seq)>,
 }
 
 impl World {
-    fn new(fates: Vec<Fate>, path: Path) -> Self {
+    fn new(fates: Vec<Fate>, via: Via) -> Self {
         Self {
             now: Time(0),
-            sender: sender(path, 1),
+            sender: sender(via, 1),
             receiver: receiver(),
             fates,
             sent: 0,
@@ -539,14 +673,30 @@ impl World {
 
     /// Drains both machines until neither has anything to do at this instant.
     fn settle(&mut self) {
-        while let Some(SenderEvent::Repeat { stream, to }) = self.sender.poll_event() {
-            let (epoch, seq, len) = self.present;
-            let bytes = payload(epoch, seq, len);
-            self.sender
-                .repeat(stream, to, &meta(epoch, seq), &bytes, self.now);
+        loop {
+            while let Some(SenderEvent::Fetch(fetch)) = self.sender.poll_event() {
+                let (epoch, seq, len) = self.present;
+                let found = (meta(epoch, seq), payload(epoch, seq, len));
+                let found = (seq > 0).then_some((&found.0, &found.1));
+                self.sender.fetched(&fetch, found, self.now);
+            }
+            self.sender.flush(self.now);
+            if !self.fly() {
+                break;
+            }
         }
-        self.sender.flush(self.now);
-        for (_, datagram) in drain(&mut self.sender) {
+        self.take();
+    }
+
+    /// Puts on the link what the sender has to send. Whether that was anything.
+    fn fly(&mut self) -> bool {
+        let datagrams = drain(&mut self.sender);
+        let any = !datagrams.is_empty();
+        for (_, datagram) in datagrams {
+            if datagram.len() > 1_200 {
+                // The link is one for short datagrams.
+                continue;
+            }
             let (fate, id) = self.next_fate();
             for copy in 0..fate.copies {
                 let delay = Duration::from_micros(fate.delay_us + u64::from(copy) * 40);
@@ -556,6 +706,10 @@ impl World {
                 }
             }
         }
+        any
+    }
+
+    fn take(&mut self) {
         while let Some(sample) = self.receiver.poll_sample() {
             let (epoch, seq) = (sample.meta.epoch, sample.meta.seq);
             let whole = payload(epoch.0, seq.0, sample.payload.len());
@@ -564,16 +718,19 @@ impl World {
             self.got.push((epoch, seq));
         }
         while let Some(event) = self.receiver.poll_event() {
-            let ReceiverEvent::Quiet { epoch, seq, .. } = event else {
-                continue;
-            };
             let (fate, id) = self.next_fate();
-            if !fate.lost {
-                let delay = Duration::from_micros(fate.delay_us);
-                // The control side may wait 20 ms for other confirmations.
-                self.acks
-                    .insert((self.now + 20 * MS + delay, id), (epoch, seq));
+            if fate.lost {
+                continue;
             }
+            let at = self.now + Duration::from_micros(fate.delay_us);
+            match event {
+                // The control side may wait 20 ms for other confirmations.
+                ReceiverEvent::Quiet { .. } => self.acks.insert((at + 20 * MS, id), event),
+                ReceiverEvent::Nack(..) | ReceiverEvent::Report(..) => {
+                    self.acks.insert((at, id), event)
+                }
+                ReceiverEvent::Flows { .. } | ReceiverEvent::OnGroup { .. } => None,
+            };
         }
     }
 
@@ -600,8 +757,18 @@ impl World {
             while let Some(entry) = self.acks.first_entry()
                 && entry.key().0 <= self.now
             {
-                let (epoch, seq) = entry.remove();
-                self.sender.held(STREAM, READER, epoch, seq, self.now);
+                match entry.remove() {
+                    ReceiverEvent::Quiet { epoch, seq, .. } => {
+                        self.sender.held(STREAM, READER, epoch, seq, self.now);
+                    }
+                    ReceiverEvent::Nack(_, nack) => {
+                        self.sender.handle_nack(READER, &nack, self.now);
+                    }
+                    ReceiverEvent::Report(_, report) => {
+                        self.sender.handle_report(READER, &report, self.now);
+                    }
+                    ReceiverEvent::Flows { .. } | ReceiverEvent::OnGroup { .. } => {}
+                }
             }
             self.sender.handle_timeout(self.now);
             self.receiver.handle_timeout(self.now);
@@ -631,7 +798,7 @@ fn clean_link_carries_each_sample_once() {
             copies: 1,
             delay_us: 10_000,
         };
-        let mut world = World::new(vec![fate], Path::Unicast);
+        let mut world = World::new(vec![fate], Via::Unicast);
         for seq in 1..=10 {
             world.write(1, seq, 100);
             world.run_until(world.now + MS * gap_ms);
@@ -650,10 +817,10 @@ proptest! {
         writes in prop::collection::vec((0..150_u64, 1..9_000_usize, 0..12_u8), 1..40),
         both in any::<bool>(),
     ) {
-        let path = if both { Path::Both(group()) } else { Path::Unicast };
+        let via = if both { Via::Both(group()) } else { Via::Unicast };
         // A link that loses everything is a partition: some datagrams of the cycle get through.
         prop_assume!(fates.iter().filter(|fate| !fate.lost).count() * 2 > fates.len());
-        let mut world = World::new(fates, path);
+        let mut world = World::new(fates, via);
         let (mut epoch, mut seq) = (1, 0);
         for (gap_ms, len, change) in writes {
             if change == 0 {

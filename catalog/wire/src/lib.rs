@@ -24,7 +24,7 @@ pub mod sample;
 pub mod seal;
 mod time;
 
-pub use contract::Contract;
+pub use contract::{Contract, Delivery, Priority};
 pub use description::{ItemDescription, SchemaHash, WriterState};
 pub use id::{DomainId, Epoch, HostId, Incarnation, Seq, StreamId, Tag};
 pub use name::{HostName, ItemName, NameError, Pattern, PatternError};

@@ -12,6 +12,10 @@ use crate::{
     StreamId, Tag, Time,
 };
 
+/// Most entries of one report.
+pub const REPORTS_MAX: usize = 32;
+/// Most missing parts in one message.
+pub const NACK_PARTS_MAX: usize = 100;
 /// Greatest length of an encoded message, bytes: a datagram less its header and seal.
 pub const BODY_MAX_BYTES: usize = 1_160;
 /// Most control addresses of one host.
@@ -168,6 +172,10 @@ pub enum Message {
         /// All of them, at most four.
         control_addrs: Vec<SocketAddr>,
     },
+    /// How your datagrams reach me.
+    Report(Vec<ReportEntry>),
+    /// I lack these.
+    Nack(Vec<NackEntry>),
     /// Your beacon came here by multicast.
     BeaconHeard,
 }
@@ -295,6 +303,47 @@ pub struct AckEntry {
     pub seq: Seq,
 }
 
+/// How the datagrams of one path arrive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ReportEntry {
+    /// The sender's number for the path.
+    pub path: u16,
+    /// Greatest number of a datagram that arrived.
+    pub highest: u32,
+    /// Datagrams that arrived since the first, comes round.
+    pub received: u32,
+    /// Bytes of them, headers and seals included, comes round.
+    pub bytes: u32,
+    /// Least time on the way since the last report: arrival on this host's clock less `sent_us`, comes round.
+    pub delay_us: u32,
+    /// When this was written, microseconds of the reporter's clock; comes round.
+    pub at_us: u32,
+    /// Longest datagram that ever arrived, bytes.
+    pub longest: u16,
+}
+
+/// What a reading host lacks of one stream.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NackEntry {
+    /// The stream.
+    pub stream: StreamId,
+    /// The writer's tenure.
+    pub epoch: Epoch,
+    /// The sample, or the first of several.
+    pub seq: Seq,
+    /// What of it.
+    pub lacks: Lacks,
+}
+
+/// What is missing.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Lacks {
+    /// So many samples, from the one named on.
+    Samples(u32),
+    /// Parts of the sample: offset and length of each, bytes.
+    Parts(Vec<(u32, u32)>),
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -360,6 +409,23 @@ mod tests {
             to: u64::MAX,
         };
         assert!(length(&Message::Pull(vec![range; 32])) <= BODY_MAX_BYTES);
+        let report = ReportEntry {
+            path: u16::MAX,
+            highest: u32::MAX,
+            received: u32::MAX,
+            bytes: u32::MAX,
+            delay_us: u32::MAX,
+            at_us: u32::MAX,
+            longest: u16::MAX,
+        };
+        assert!(length(&Message::Report(vec![report; REPORTS_MAX])) <= BODY_MAX_BYTES);
+        let nack = NackEntry {
+            stream: StreamId(u32::MAX),
+            epoch: Epoch(u64::MAX),
+            seq: Seq(u64::MAX),
+            lacks: Lacks::Parts(vec![(u32::MAX, u32::MAX); NACK_PARTS_MAX]),
+        };
+        assert!(length(&Message::Nack(vec![nack])) <= BODY_MAX_BYTES);
         let part = SchemaPart {
             hash: SchemaHash([0xff; 16]),
             index: 63,
@@ -392,7 +458,7 @@ mod tests {
         assert_eq!(bytes, [17, 3, 1, 0, 10, 0, 0, 1, 7]);
         bytes.clear();
         codec::encode(&Message::BeaconHeard, &mut bytes).unwrap();
-        assert_eq!(bytes, [18]);
+        assert_eq!(bytes, [20]);
         let renewed = Message::Renewed {
             echo: Time(1),
             at: Time(2),

@@ -1,8 +1,11 @@
-//! What a data datagram holds: one or more records, each a whole small sample or one fragment of a larger one.
+//! What a data datagram holds: a preamble, then records, each a whole small sample or one fragment of a larger one.
 //!
 //! Laid out by hand and read without a copy. Layout: `PROTOCOL.md`, "Sample datagrams" and "Fragments".
 
 use crate::{Epoch, Seq, StreamId, Time};
+
+/// Length of the preamble at the head of each plaintext, bytes.
+pub const PREAMBLE_BYTES: usize = 12;
 
 /// Length of a record before its payload, bytes.
 pub const RECORD_BYTES: usize = 48;
@@ -10,8 +13,8 @@ pub const RECORD_BYTES: usize = 48;
 /// Length of a fragment's record before its payload, bytes.
 pub const FRAGMENT_RECORD_BYTES: usize = 56;
 
-/// Greatest sample, bytes.
-pub const MAX_SAMPLE_BYTES: usize = 65_536;
+/// Greatest sample, bytes: 64 MiB.
+pub const MAX_SAMPLE_BYTES: usize = 64 << 20;
 
 /// What is known of a sample beside its payload. Times are of the origin's clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -26,6 +29,19 @@ pub struct SampleMeta {
     pub capture: Time,
     /// When it was written.
     pub publish: Time,
+}
+
+/// What lets a receiver tell how a path does: it counts what is missing, and sees the time on the way change.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Preamble {
+    /// The sender's number for the destination.
+    pub path: u16,
+    /// How many datagrams went there, this one included; comes round.
+    pub number: u32,
+    /// When it left, microseconds of the sender's clock; comes round each 71 minutes.
+    pub sent_us: u32,
+    /// What follows is padding: the datagram only tries whether its length gets through.
+    pub is_probe: bool,
 }
 
 /// Place of a fragment in its sample.
@@ -44,6 +60,9 @@ pub struct Record<'a> {
     pub stream: StreamId,
     /// Whether the sample may have been sent before: a repair.
     pub repeat: bool,
+    /// The sample cannot be had any more, nor `payload` others before it: the ring let them go. Its payload is that
+    /// number, 8 bytes.
+    pub gone: bool,
     /// Which sample.
     pub meta: SampleMeta,
     /// Which part of the sample; `None` is all of it.
@@ -62,6 +81,18 @@ pub struct Records<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("malformed sample record")]
 pub struct Malformed;
+
+impl Preamble {
+    /// The bytes on the wire.
+    pub fn to_bytes(self) -> [u8; PREAMBLE_BYTES] {
+        let flags = if self.is_probe { PROBE } else { 0 };
+        let [p0, p1] = self.path.to_le_bytes();
+        let [f0, f1] = flags.to_le_bytes();
+        let [n0, n1, n2, n3] = self.number.to_le_bytes();
+        let [s0, s1, s2, s3] = self.sent_us.to_le_bytes();
+        [p0, p1, f0, f1, n0, n1, n2, n3, s0, s1, s2, s3]
+    }
+}
 
 impl<'a> Record<'a> {
     /// Length of the record on the wire, bytes.
@@ -84,12 +115,13 @@ impl<'a> Record<'a> {
         let len = u16::try_from(self.payload.len()).map_err(|_| Malformed)?;
         let fragment = if self.fragment.is_some() { FRAGMENT } else { 0 };
         let repeat = if self.repeat { REPEAT } else { 0 };
+        let gone = if self.gone { GONE } else { 0 };
         // One growth of the vector for the head keeps the encoder at memcpy speed.
         let mut head = [0; RECORD_BYTES];
         let words = [
             (u64::from(self.stream.0))
                 | (u64::from(len) << 32)
-                | (u64::from(fragment | repeat) << 48),
+                | (u64::from(fragment | repeat | gone) << 48),
             self.meta.epoch.0,
             self.meta.seq.0,
             self.meta.filtered,
@@ -118,19 +150,46 @@ impl<'a> Record<'a> {
                 && fragment.total <= limit
                 && end.is_some_and(|end| end <= fragment.total)
         });
-        whole && self.meta.seq.0 != 0
+        let gone = !self.gone || (self.fragment.is_none() && self.payload.len() == 8);
+        whole && gone && self.meta.seq.0 != 0
+    }
+
+    /// How many samples a record about lost ones is about: those that end with its own.
+    pub fn gone_count(&self) -> Option<u64> {
+        let count = u64::from_le_bytes(*self.payload.first_chunk()?);
+        self.gone
+            .then_some(count.saturating_add(1).min(self.meta.seq.0))
     }
 }
 
 impl<'a> Records<'a> {
-    /// Starts at the first record of an opened datagram.
-    pub fn new(plaintext: &'a [u8]) -> Self {
-        Self { rest: plaintext }
+    /// Reads the head of an opened datagram, and starts at its first record. `None` if the head is not one.
+    pub fn open(plaintext: &'a [u8]) -> Option<(Preamble, Self)> {
+        let (&[p0, p1, f0, f1], rest) = plaintext.split_first_chunk()?;
+        let (number, rest) = rest.split_first_chunk()?;
+        let (sent_us, rest) = rest.split_first_chunk()?;
+        let flags = u16::from_le_bytes([f0, f1]);
+        if flags & !PROBE != 0 {
+            return None;
+        }
+        let preamble = Preamble {
+            path: u16::from_le_bytes([p0, p1]),
+            number: u32::from_le_bytes(*number),
+            sent_us: u32::from_le_bytes(*sent_us),
+            is_probe: flags & PROBE != 0,
+        };
+        let rest = if preamble.is_probe { &[] } else { rest };
+        Some((preamble, Self { rest }))
+    }
+
+    /// Starts at a record.
+    pub fn new(records: &'a [u8]) -> Self {
+        Self { rest: records }
     }
 
     fn read(bytes: &'a [u8]) -> Option<(Record<'a>, &'a [u8])> {
         let (&[s0, s1, s2, s3, l0, l1, flags, reserved], rest) = bytes.split_first_chunk()?;
-        if flags & !(FRAGMENT | REPEAT) != 0 || reserved != 0 {
+        if flags & !(FRAGMENT | REPEAT | GONE) != 0 || reserved != 0 {
             return None;
         }
         let (epoch, rest) = split_u64(rest)?;
@@ -152,6 +211,7 @@ impl<'a> Records<'a> {
         let record = Record {
             stream: StreamId(u32::from_le_bytes([s0, s1, s2, s3])),
             repeat: flags & REPEAT != 0,
+            gone: flags & GONE != 0,
             meta: SampleMeta {
                 epoch: Epoch(epoch),
                 seq: Seq(seq),
@@ -192,6 +252,10 @@ fn split_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
 const FRAGMENT: u8 = 1;
 /// Flag: the sample may have been sent before.
 const REPEAT: u8 = 2;
+/// Flag: the sample cannot be had any more.
+const GONE: u8 = 4;
+/// Flag of the preamble: padding follows.
+const PROBE: u16 = 1;
 
 #[cfg(test)]
 mod tests {
@@ -203,6 +267,7 @@ mod tests {
         Record {
             stream: StreamId(0x0403_0201),
             repeat: true,
+            gone: false,
             meta: SampleMeta {
                 epoch: Epoch(0x10),
                 seq: Seq(0x20),
@@ -274,7 +339,7 @@ mod tests {
             assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed), "{bad:?}");
         }
         let good = encoded(record(b"ab"));
-        for (at, value) in [(4, 3), (6, 4), (7, 1), (16, 0)] {
+        for (at, value) in [(4, 3), (6, 4), (6, 8), (7, 1), (16, 0)] {
             let mut bad = good.clone();
             bad[at] = value;
             assert_eq!(Records::new(&bad).next(), Some(Err(Malformed)), "{at}");
@@ -284,6 +349,43 @@ mod tests {
             assert_eq!(records.next(), Some(Err(Malformed)));
             assert_eq!(records.next(), None);
         }
+    }
+
+    #[test]
+    fn a_preamble_reads_back_and_a_probe_has_no_records() {
+        for is_probe in [false, true] {
+            let preamble = Preamble {
+                path: 0x0102,
+                number: 0x0304_0506,
+                sent_us: 0x0708_090a,
+                is_probe,
+            };
+            let mut bytes = preamble.to_bytes().to_vec();
+            assert_eq!(bytes[..4], [2, 1, u8::from(is_probe), 0]);
+            bytes.extend([9; 3]);
+            let (read, records) = Records::open(&bytes).unwrap();
+            assert_eq!(read, preamble);
+            assert_eq!(records.count(), usize::from(!is_probe));
+        }
+        assert!(Records::open(&[0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]).is_none());
+        assert!(Records::open(&[0; 11]).is_none());
+    }
+
+    #[test]
+    fn lost_samples_are_told_by_number() {
+        let count = 4_u64.to_le_bytes();
+        let gone = Record {
+            gone: true,
+            ..record(&count)
+        };
+        let bytes = encoded(gone);
+        assert_eq!(Records::new(&bytes).next(), Some(Ok(gone)));
+        assert_eq!(gone.gone_count(), Some(5));
+        let bad = Record {
+            gone: true,
+            ..record(b"short")
+        };
+        assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed));
     }
 
     proptest! {

@@ -5,7 +5,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use ddx_store::{Store, Wait, wait_any};
+use ddx_store::{ReaderOptions, Store, Wait, wait_any};
 use ddx_wire::{Pattern, Time};
 use serde_json::{Value, json};
 
@@ -112,7 +112,11 @@ impl<'a> Show<'a> {
         self.crossed.samples_unread = self.meter.total();
         self.crossed.link_unread = self.crossed.link;
         for (name, subscription) in &mut self.items {
-            *subscription = Some(Subscription::open(&self.base, name, None)?);
+            *subscription = Some(Subscription::open(
+                &self.base,
+                name,
+                ReaderOptions::default(),
+            )?);
         }
         Ok(())
     }
@@ -343,8 +347,12 @@ impl Meter {
 }
 
 fn open_counters(stage: &Stage) -> anyhow::Result<Subscription> {
-    Subscription::open(&stage.robot.store()?, "@/counters", None)
-        .context("read the counters of robot1")
+    Subscription::open(
+        &stage.robot.store()?,
+        "@/counters",
+        ReaderOptions::default(),
+    )
+    .context("read the counters of robot1")
 }
 
 fn known(bytes: Option<u64>) -> String {

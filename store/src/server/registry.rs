@@ -323,7 +323,7 @@ impl Registry {
                 name,
                 schema,
                 pins,
-                rate_mhz,
+                contract,
                 held,
             } => {
                 let reader = Reader {
@@ -331,9 +331,7 @@ impl Registry {
                     handle,
                     schema: schema.map(|text| parse_schema(&text)).transpose()?,
                     extra_pins: pins,
-                    contract: Contract {
-                        max_rate_mhz: rate_mhz,
-                    },
+                    contract,
                     seat: None,
                     refused: None,
                 };

@@ -316,6 +316,7 @@ impl World {
             _ => {
                 let contract = Contract {
                     max_rate_mhz: Some(10_000),
+                    ..Contract::default()
                 };
                 let _full = self.catalog.subscribe(name, contract, self.now);
             }
@@ -450,9 +451,9 @@ impl World {
             }
             Event::OpenStream { stream, route, .. } => {
                 self.open.entry(stream).or_default();
-                self.sender.open(stream, route, self.now);
+                self.sender.open(stream, &route, self.now);
             }
-            Event::UpdateStream { stream, route } => self.sender.update(stream, route, self.now),
+            Event::UpdateStream { stream, route } => self.sender.update(stream, &route, self.now),
             Event::CloseStream { stream } => {
                 self.open.remove(&stream);
                 self.sender.close(stream);
@@ -649,6 +650,9 @@ fn message(input: &mut Input<'_>) -> Message {
                 name: item_name(input.pick(&NAMES)),
                 contract: Contract {
                     max_rate_mhz: input.flag().then(|| input.word()),
+                    max_age_ms: input.flag().then(|| input.word()),
+                    delivery: input.pick(&[Delivery::Latest, Delivery::Every, Delivery::EveryFromRing]),
+                    ..Contract::default()
                 },
                 epoch: Epoch(input.number()),
                 seq: Seq(input.number()),

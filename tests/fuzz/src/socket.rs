@@ -18,7 +18,7 @@ use ddx_store::control::{
 use ddx_store::notify::Bells;
 use ddx_store::segment::{Origin, SegmentFds, SegmentWriter, Spec};
 use ddx_store::server::registry::{ClientId, Effect, Event, Identity, Registry, RemoteItem};
-use ddx_wire::{Epoch, HostName, ItemDescription, ItemName, SchemaHash, Seq, Time, WriterState};
+use ddx_wire::{Contract, Epoch, HostName, ItemDescription, ItemName, SchemaHash, Seq, Time, WriterState};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 
@@ -417,7 +417,11 @@ fn request(input: &mut Input<'_>) -> Request {
             name: text(input, &NAMES),
             schema: input.flag().then(|| text(input, &SCHEMAS)),
             pins: input.word(),
-            rate_mhz: input.flag().then(|| input.word()),
+            contract: Contract {
+                max_rate_mhz: input.flag().then(|| input.word()),
+                max_age_ms: input.flag().then(|| input.word()),
+                ..Contract::default()
+            },
             held: input.flag().then(|| HeldCell {
                 epoch: Epoch(input.number()),
                 cell: input.word(),

@@ -78,7 +78,7 @@ impl Registry {
                 Some(ReaderEntry {
                     program: client.program.clone(),
                     pid: client.pid,
-                    rate_mhz: reader.contract.max_rate_mhz,
+                    contract: reader.contract,
                     bound: reader.seat.is_some(),
                     refused: reader
                         .refused

@@ -86,7 +86,7 @@ impl Bench {
             name: "n".to_owned(),
             schema: None,
             pins: 0,
-            rate_mhz: None,
+            contract: Contract::default(),
             held: None,
         };
         self.ask(client, request, vec![])
@@ -223,7 +223,7 @@ fn a_description_fits_one_message_whatever_others_have_said() {
             name: "n".to_owned(),
             schema: Some(nested("u16")),
             pins: 0,
-            rate_mhz: None,
+            contract: Contract::default(),
             held: None,
         };
         assert!(matches!(

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use ddx_catalog::delivery::{ReceiverEvent, Route};
 use ddx_catalog::{Catalog, Config, Dest, Event};
+use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::{DomainKey, Opener, Purpose, Sealer};
 use ddx_wire::{
     ClockOffset, Contract, Epoch, HostId, HostName, ItemDescription, ItemName, SchemaHash, Seq,
@@ -103,7 +104,9 @@ enum Order {
     DropSession(Tag),
     Mirror(MirrorId, ItemName),
     DropMirror(MirrorId),
-    Expect(Tag, StreamId, MirrorId),
+    Expect((Tag, StreamId), Contract, MirrorId),
+    Report(Tag, ReportEntry),
+    Nack(Tag, NackEntry),
     Forget(Tag, StreamId),
     Clock(Tag, ClockOffset),
 }
@@ -310,7 +313,7 @@ impl Host {
                 data.obey(order, now.local);
             }
             data.tx.work(&data.store, now.local, &mut self.out.samples);
-            data.rx.receiver.handle_timeout(now.local);
+            data.rx.handle_timeout(now.local);
             while let Some(event) = data.rx.receiver.poll_event() {
                 data.notices.put(event, now.truth);
             }
@@ -333,6 +336,8 @@ impl Host {
                     ReceiverEvent::OnGroup { tag, stream } => {
                         catalog.heard_on_group(tag, stream, now.local);
                     }
+                    ReceiverEvent::Report(tag, report) => catalog.report(tag, report, now.local),
+                    ReceiverEvent::Nack(tag, nack) => catalog.nack(tag, nack, now.local),
                 }
             }
             if !noticed {
@@ -400,11 +405,15 @@ impl Host {
                 seq,
             } => Order::Held(stream, tag, epoch, seq),
             Event::Expect {
-                tag, stream, name, ..
+                tag,
+                stream,
+                name,
+                contract,
+                ..
             } => {
                 self.expected.insert((tag, stream), name.clone());
                 let mirror = data.mirror(&name, (tag, stream), now);
-                Order::Expect(tag, stream, mirror)
+                Order::Expect((tag, stream), contract, mirror)
             }
             Event::Forget { tag, stream } => {
                 self.expected.remove(&(tag, stream));
@@ -413,6 +422,8 @@ impl Host {
                 }
                 Order::Forget(tag, stream)
             }
+            Event::Report { tag, report } => Order::Report(tag, report),
+            Event::Nack { tag, nack } => Order::Nack(tag, nack),
             Event::Session { tag, opener, .. } => Order::Session(tag, opener),
             Event::SessionClosed { tag } => Order::DropSession(tag),
             Event::JoinGroup(group) => {
@@ -444,8 +455,8 @@ impl Host {
 impl Data {
     fn obey(&mut self, order: Order, now: Time) {
         match order {
-            Order::Open(stream, item, route, seen) => self.tx.open(stream, item, route, seen, now),
-            Order::Update(stream, route) => self.tx.sender.update(stream, route, now),
+            Order::Open(stream, item, route, seen) => self.tx.open(stream, item, &route, seen, now),
+            Order::Update(stream, route) => self.tx.sender.update(stream, &route, now),
             Order::Close(stream) => self.tx.close(stream),
             Order::Held(stream, tag, epoch, seq) => {
                 self.tx.sender.held(stream, tag, epoch, seq, now);
@@ -457,11 +468,14 @@ impl Data {
                 self.rx.mirrors.insert(id, Mirror { name, newest });
             }
             Order::DropMirror(id) => self.rx.drop_mirror(id),
-            Order::Expect(tag, stream, mirror) => self.rx.expect(tag, stream, mirror, now),
+            Order::Expect(at, contract, mirror) => self.rx.expect(at, &contract, mirror, now),
+            Order::Report(tag, report) => self.tx.sender.handle_report(tag, &report, now),
+            Order::Nack(tag, nack) => self.tx.sender.handle_nack(tag, &nack, now),
             Order::Forget(tag, stream) => self.rx.forget(tag, stream),
             Order::Clock(tag, offset) => {
                 let time = Duration::from_nanos(offset.bound_ns.saturating_mul(2));
                 self.tx.sender.round_trip(tag, time);
+                self.rx.receiver.round_trip(tag, time);
                 self.rx.set_clock(tag, offset, now);
             }
         }

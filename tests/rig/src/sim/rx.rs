@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use ddx_catalog::delivery::{Books, Received, Receiver, ReceiverConfig};
 use ddx_wire::seal::KeyId;
-use ddx_wire::{ClockOffset, Epoch, ItemName, Seq, StreamId, Tag, Time};
+use ddx_wire::{ClockOffset, Contract, Epoch, ItemName, Seq, StreamId, Tag, Time};
 
 use super::HostClock;
 use super::store::Told;
@@ -57,8 +57,14 @@ impl Rx {
         }
     }
 
-    pub(super) fn expect(&mut self, tag: Tag, stream: StreamId, mirror: MirrorId, now: Time) {
-        self.receiver.listen(tag, stream, now);
+    pub(super) fn expect(
+        &mut self,
+        (tag, stream): (Tag, StreamId),
+        contract: &Contract,
+        mirror: MirrorId,
+        now: Time,
+    ) {
+        self.receiver.listen(tag, stream, contract, now);
         let fresh = Stream {
             mirror,
             newest: None,
@@ -100,6 +106,11 @@ impl Rx {
         self.take_arrived(now);
     }
 
+    pub(super) fn handle_timeout(&mut self, now: Time) {
+        self.receiver.handle_timeout(now);
+        self.take_arrived(now);
+    }
+
     fn take_arrived(&mut self, now: Time) {
         let mut arrived = Vec::new();
         while let Some(sample) = self.receiver.poll_sample() {
@@ -119,7 +130,9 @@ impl Rx {
                 },
                 now,
             );
-            self.check_books(tag, stream);
+        }
+        for (tag, stream, ..) in &arrived {
+            self.check_books(*tag, *stream);
         }
     }
 

@@ -119,6 +119,12 @@ impl Item {
         self.ring.iter().find(|sample| sample.pos > seen)
     }
 
+    /// The oldest sample still there that is not older than this one.
+    pub(super) fn first_from(&self, epoch: Epoch, seq: Seq) -> Option<&Sample> {
+        let order = |sample: &&Sample| (sample.meta.epoch, sample.meta.seq) >= (epoch, seq);
+        self.ring.iter().find(order)
+    }
+
     pub(super) fn last_pos(&self) -> u64 {
         self.last_pos
     }

@@ -3,15 +3,14 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 
-use ddx_catalog::delivery::{Due, Route, Sender, SenderConfig, SenderEvent};
-use ddx_wire::sample::SampleMeta;
-use ddx_wire::seal::Sealer;
+use ddx_catalog::delivery::{Due, Route, Sender, SenderConfig, SenderEvent, Want};
+use ddx_wire::seal::{MAX_DATAGRAM_BYTES, Sealer};
 use ddx_wire::{Epoch, ItemName, Seq, StreamId, Time};
 
 use super::store::Store;
 
 pub(super) struct Tx {
-    pub(super) sender: Sender,
+    pub(super) sender: Sender<Vec<u8>>,
     streams: BTreeMap<StreamId, Stream>,
     /// Items of which something was sent since this was last emptied.
     pub(super) sent: Vec<ItemName>,
@@ -36,7 +35,6 @@ struct Stream {
     item: ItemName,
     limited: bool,
     newest: (Epoch, Seq),
-    filtered: u64,
     due: Option<Time>,
     /// Position of the last sample that was read.
     seen: u64,
@@ -44,8 +42,12 @@ struct Stream {
 
 impl Tx {
     pub(super) fn new(sealer: Sealer, now: Time) -> Self {
+        let config = SenderConfig {
+            datagram_bytes_max: MAX_DATAGRAM_BYTES,
+            ..SenderConfig::default()
+        };
         Self {
-            sender: Sender::new(SenderConfig::default(), sealer, now),
+            sender: Sender::new(config, sealer, now),
             streams: BTreeMap::new(),
             sent: Vec::new(),
             counts: Counts::default(),
@@ -57,15 +59,14 @@ impl Tx {
         &mut self,
         id: StreamId,
         item: ItemName,
-        route: Route,
+        route: &Route,
         seen: u64,
         now: Time,
     ) {
         let stream = Stream {
             item,
-            limited: route.contract.max_rate_mhz.is_some(),
+            limited: route.contract.interval_ns() > 0,
             newest: Default::default(),
-            filtered: 0,
             due: None,
             seen,
         };
@@ -85,10 +86,15 @@ impl Tx {
             self.pull(id, store, now);
         }
         self.sender.handle_timeout(now);
-        self.repeat(store, now);
         self.sender.flush(now);
         let mut bytes = Vec::new();
-        while let Some(transmit) = self.sender.poll_transmit(&mut bytes) {
+        loop {
+            self.fetch(store, now);
+            self.sender.flush(now);
+
+            let Some(transmit) = self.sender.poll_transmit(&mut bytes) else {
+                return;
+            };
             let segment = transmit.segment.map_or(bytes.len(), usize::from);
             for datagram in bytes.chunks(segment.max(1)) {
                 self.counts.datagrams += 1;
@@ -129,11 +135,10 @@ impl Tx {
                 return;
             };
             stream.seen = sample.pos;
-            if stream.is_new(&sample.meta) {
-                let meta = stream.meta(&sample.meta);
-                stream.newest = (meta.epoch, meta.seq);
-                stream.filtered = meta.filtered;
-                self.sender.write(id, &meta, &sample.payload, now);
+            let at = (sample.meta.epoch, sample.meta.seq);
+            if at > stream.newest {
+                stream.newest = at;
+                self.sender.write(id, &sample.meta, &sample.payload, now);
                 self.counts.writes += 1;
                 self.sent.push(stream.item.clone());
             } else if stream.limited {
@@ -142,35 +147,23 @@ impl Tx {
         }
     }
 
-    fn repeat(&mut self, store: &Store, now: Time) {
-        while let Some(SenderEvent::Repeat { stream: id, to }) = self.sender.poll_event() {
-            let Some(stream) = self.streams.get(&id) else {
+    fn fetch(&mut self, store: &Store, now: Time) {
+        while let Some(SenderEvent::Fetch(fetch)) = self.sender.poll_event() {
+            let Some(stream) = self.streams.get(&fetch.stream) else {
                 continue;
             };
-            if let Some(sample) = store.get(&stream.item).and_then(|item| item.current()) {
-                let meta = stream.meta(&sample.meta);
-                self.sender.repeat(id, to, &meta, &sample.payload, now);
-                self.counts.repeats += 1;
+            let item = store.get(&stream.item);
+            let sample = item.and_then(|item| match fetch.want {
+                Want::Newest => item.current(),
+                Want::After(epoch, seq) => item.first_from(epoch, Seq(seq.0 + 1)),
+                Want::At(epoch, seq) => item.first_from(epoch, seq),
+            });
+            let found = sample.map(|sample| (&sample.meta, &sample.payload));
+            self.sender.fetched(&fetch, found, now);
+            if sample.is_some() {
+                self.counts.repeats += u64::from(fetch.again);
                 self.sent.push(stream.item.clone());
             }
         }
-    }
-}
-
-impl Stream {
-    fn is_new(&self, meta: &SampleMeta) -> bool {
-        (meta.epoch, meta.seq) > self.newest
-    }
-
-    /// What is told about a sample: all that lies between it and the last one sent was left out here.
-    fn meta(&self, meta: &SampleMeta) -> SampleMeta {
-        let (epoch, Seq(last)) = self.newest;
-        let filtered = if meta.epoch == epoch {
-            self.filtered
-                .saturating_add(meta.seq.0.saturating_sub(last).saturating_sub(1))
-        } else {
-            meta.seq.0.saturating_sub(1)
-        };
-        SampleMeta { filtered, ..*meta }
     }
 }

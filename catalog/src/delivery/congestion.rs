@@ -1,0 +1,436 @@
+//! Learns how fast a path may be used: the rate at which nothing piles up on the way.
+//!
+//! What piles up shows as growth of the time on the way over its recent least value. Loss alone does not slow a path
+//! down, because radio loses without being full; only loss that comes on top of what the path always loses does. The
+//! rate follows what arrives when the path is full, and grows while the sender has more to send than it lets through.
+
+use std::time::Duration;
+
+use ddx_wire::Time;
+use ddx_wire::message::ReportEntry;
+
+/// The rate of one path.
+#[derive(Debug)]
+pub(super) struct Congestion {
+    bytes_per_second: f64,
+    /// Share of datagrams that the path loses without being full.
+    loss: f64,
+    /// Newest share of datagrams lost.
+    loss_now: f64,
+    /// Newest growth of the time on the way.
+    queue: Duration,
+    /// Reports in a row without a sign of a full path.
+    calm: u32,
+    /// Whether the path was ever full: before, the rate is a guess.
+    was_full: bool,
+    slowed_at: Time,
+    /// The rate before nothing was heard any more.
+    before_silence: Option<f64>,
+}
+
+/// What one report adds to the one before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Progress {
+    /// Time between the two, by the reporter's clock.
+    pub(super) span: Duration,
+    /// Datagrams that arrived.
+    pub(crate) received: u32,
+    /// Datagrams that did not.
+    pub(crate) missing: u32,
+    /// Bytes that arrived.
+    pub(super) bytes: u32,
+}
+
+/// One host that reports about a path, and what it said.
+#[derive(Debug)]
+pub(super) struct Reporter {
+    last: ReportEntry,
+    /// The first time on the way that it told: others are compared with it, since its clock has a zero of its own.
+    zero: u32,
+    least: Least,
+}
+
+/// Least value of the last ten to twenty seconds.
+#[derive(Debug, Default)]
+struct Least {
+    present: Option<i64>,
+    former: Option<i64>,
+    since: Time,
+}
+
+impl Congestion {
+    pub(super) fn new(now: Time) -> Self {
+        Self {
+            bytes_per_second: RATE_FIRST,
+            loss: 0.0,
+            loss_now: 0.0,
+            queue: Duration::ZERO,
+            calm: 0,
+            was_full: false,
+            slowed_at: now,
+            before_silence: None,
+        }
+    }
+
+    /// The rate now, bytes per second.
+    pub(super) fn rate(&self) -> u64 {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "it lies between two positive constants that fit"
+        )]
+        let rate = self.bytes_per_second as u64;
+        rate
+    }
+
+    /// Newest growth of the time on the way.
+    pub(super) fn queue(&self) -> Duration {
+        self.queue
+    }
+
+    /// Newest share of datagrams lost, thousandths.
+    pub(super) fn loss_permille(&self) -> u16 {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a share is between 0 and 1"
+        )]
+        let permille = (self.loss_now * 1000.0) as u16;
+        permille
+    }
+
+    /// Takes in a report. `limited` tells whether the rate held the sender back since the one before.
+    pub(super) fn handle_report(
+        &mut self,
+        progress: &Progress,
+        queue: Duration,
+        limited: bool,
+        round_trip: Duration,
+        now: Time,
+    ) {
+        if let Some(rate) = self.before_silence.take() {
+            // The link is back, perhaps as it was.
+            self.bytes_per_second = (rate / 2.0).max(self.bytes_per_second);
+        }
+        self.queue = queue;
+        let all = f64::from(progress.received) + f64::from(progress.missing);
+        if all > 0.0 {
+            self.loss_now = f64::from(progress.missing) / all;
+        }
+        let arrived = f64::from(progress.bytes) / progress.span.as_secs_f64().max(0.001);
+        let capacity = arrived / (1.0 - self.loss.min(0.7));
+
+        let full = self.queue >= QUEUE_FULL;
+        let drops = self.loss_now > self.loss + LOSS_STEP;
+        if full || drops {
+            self.calm = 0;
+            if now >= self.slowed_at + round_trip.max(progress.span) {
+                self.slowed_at = now;
+                self.was_full |= full;
+                let share = if self.queue >= 2 * QUEUE_FULL {
+                    0.7
+                } else {
+                    0.85
+                };
+                self.bytes_per_second = if full {
+                    (capacity * share).min(self.bytes_per_second * 0.95)
+                } else {
+                    // A full path with a short queue, or one that has begun to lose: if slowing down does not help, it
+                    // is the latter.
+                    self.loss += (self.loss_now - self.loss) / 2.0;
+                    self.bytes_per_second * 0.85
+                };
+            }
+        } else {
+            if all >= 4.0 {
+                self.loss += (self.loss_now - self.loss) / 8.0;
+            }
+            if self.queue <= QUEUE_LOW && limited {
+                self.calm = self.calm.saturating_add(1);
+                let growth = match self.calm {
+                    _ if !self.was_full => 1.5,
+                    0..=2 => 1.05,
+                    3..=6 => 1.15,
+                    _ => 1.3,
+                };
+                // What was never tried is not known to fit.
+                let tried = (4.0 * capacity).max(RATE_FIRST / 8.0);
+                self.bytes_per_second =
+                    (self.bytes_per_second * growth).min(self.bytes_per_second.max(tried));
+            }
+        }
+        self.bytes_per_second = self.bytes_per_second.clamp(RATE_MIN, RATE_MAX);
+    }
+
+    /// Notes that much was sent and nothing was heard for a while: the path may be cut, or hopelessly full.
+    /// `since` is when the first of it was sent. Whether the rate was cut.
+    pub(super) fn handle_silence(&mut self, since: Time, round_trip: Duration, now: Time) -> bool {
+        let silent = now >= since.max(self.slowed_at) + SILENCE.max(3 * round_trip);
+        if silent {
+            self.before_silence.get_or_insert(self.bytes_per_second);
+            self.slowed_at = now;
+            self.calm = 0;
+            let least = RATE_SILENT.min(self.bytes_per_second);
+            self.bytes_per_second = (self.bytes_per_second / 2.0).max(least);
+        }
+        silent
+    }
+}
+
+impl Progress {
+    /// What `next` adds to `last`, two reports of one reporter; `None` if it adds nothing.
+    pub(crate) fn between(last: &ReportEntry, next: &ReportEntry) -> Option<Self> {
+        let span = next.at_us.wrapping_sub(last.at_us);
+        let received = next.received.wrapping_sub(last.received);
+        let passed = next.highest.wrapping_sub(last.highest);
+        // Half of the range: the later of two is less than that ahead.
+        let is_later = |step: u32| step < 1 << 31;
+        if received == 0 || !is_later(received) || !is_later(passed) || !is_later(span) {
+            return None;
+        }
+        Some(Self {
+            span: Duration::from_micros(span.into()),
+            received,
+            missing: passed.saturating_sub(received),
+            bytes: next.bytes.wrapping_sub(last.bytes),
+        })
+    }
+}
+
+impl Reporter {
+    pub(super) fn new(first: ReportEntry, now: Time) -> Self {
+        let mut least = Least::default();
+        least.update(0, now);
+        Self {
+            zero: first.delay_us,
+            last: first,
+            least,
+        }
+    }
+
+    /// Takes in a report: what it adds to the one before, and how much longer datagrams took than the fastest of late.
+    pub(super) fn handle_report(
+        &mut self,
+        report: &ReportEntry,
+        now: Time,
+    ) -> Option<(Progress, Duration)> {
+        let progress = Progress::between(&self.last, report);
+        self.last = *report;
+        let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
+        let least = self.least.update(delay, now);
+        let queue = u64::try_from(delay.saturating_sub(least)).unwrap_or(0);
+        Some((progress?, Duration::from_micros(queue)))
+    }
+}
+
+impl Least {
+    /// Takes in a value; the least one of late.
+    fn update(&mut self, value: i64, now: Time) -> i64 {
+        if now.since(self.since) >= WINDOW {
+            self.former = self.present.take();
+            self.since = now;
+        }
+        let present = self.present.map_or(value, |least| least.min(value));
+        self.present = Some(present);
+        self.former.map_or(present, |former| former.min(present))
+    }
+}
+
+/// A guess for a path that was never used: what a LAN carries many times, and a radio link tells at once.
+const RATE_FIRST: f64 = 12_500_000.0;
+/// One datagram each 120 ms, so that there is something to hear of.
+const RATE_MIN: f64 = 10_000.0;
+/// Nothing heard says nothing of a path that was faster before: what comes back is to be seen soon.
+const RATE_SILENT: f64 = 60_000.0;
+/// More than a core can seal.
+const RATE_MAX: f64 = 5e9;
+/// Growth of the time on the way that means a full path: above what jitter does to the least of several datagrams, and
+/// a third of what queues on the way should hold.
+const QUEUE_FULL: Duration = Duration::from_millis(30);
+/// Growth below which the rate may grow.
+const QUEUE_LOW: Duration = Duration::from_millis(15);
+/// Loss beyond the usual that means a full path whose queue is too short to show.
+const LOSS_STEP: f64 = 0.15;
+/// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
+const WINDOW: Duration = Duration::from_secs(10);
+/// Nothing heard for so long, though much was sent.
+const SILENCE: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A link of a fixed rate with a queue of 100 ms, used by a sender that always has more to send.
+    struct Bottleneck {
+        rate: f64,
+        loss: f64,
+        queue_bytes: f64,
+        worst: Duration,
+        dropped: f64,
+    }
+
+    fn run(link: &mut Bottleneck, congestion: &mut Congestion, from: Time, span: Duration) -> f64 {
+        let step = Duration::from_millis(50);
+        let mut now = from;
+        let mut delivered = 0.0;
+        while now < from + span {
+            now = now + step;
+            let sent = congestion.bytes_per_second * step.as_secs_f64();
+            let surviving = sent * (1.0 - link.loss);
+            let out = link.rate * step.as_secs_f64();
+            let arrived = (link.queue_bytes + surviving).min(out);
+            link.queue_bytes = (link.queue_bytes + surviving - arrived).max(0.0);
+            let full = (link.queue_bytes - link.rate * 0.1).max(0.0);
+            link.queue_bytes = (link.queue_bytes - full).max(0.0);
+            link.dropped += full;
+            delivered += arrived;
+            let delay = link.queue_bytes / link.rate;
+            link.worst = link.worst.max(Duration::from_secs_f64(delay));
+            let packets = |bytes: f64| whole((bytes / 1200.0).ceil());
+            let progress = Progress {
+                span: step,
+                received: packets(arrived).max(1),
+                missing: packets(sent * link.loss + full),
+                bytes: whole(arrived),
+            };
+            let queue = Duration::from_secs_f64(delay);
+            congestion.handle_report(&progress, queue, true, Duration::from_millis(20), now);
+        }
+        delivered / span.as_secs_f64()
+    }
+
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "counts of one test are small and positive"
+    )]
+    fn whole(figure: f64) -> u32 {
+        figure as u32
+    }
+
+    fn link(rate: f64, loss: f64) -> Bottleneck {
+        Bottleneck {
+            rate,
+            loss,
+            queue_bytes: 0.0,
+            worst: Duration::ZERO,
+            dropped: 0.0,
+        }
+    }
+
+    #[test]
+    fn a_full_link_is_used_well_and_not_filled() {
+        for rate in [25_000.0, 625_000.0, 12_500_000.0] {
+            for loss in [0.0, 0.02, 0.33] {
+                let mut congestion = Congestion::new(Time(0));
+                let mut link = link(rate, loss);
+                run(&mut link, &mut congestion, Time(0), Duration::from_secs(5));
+                link.worst = Duration::ZERO;
+                let later = Time(0) + Duration::from_secs(5);
+                let used = run(&mut link, &mut congestion, later, Duration::from_secs(20));
+                assert!(used > 0.8 * rate, "{used} of {rate} at {loss}");
+                assert!(
+                    link.worst < Duration::from_millis(90),
+                    "{:?} at {rate}, {loss}",
+                    link.worst
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_link_that_recovers_is_used_within_two_seconds() {
+        let mut congestion = Congestion::new(Time(0));
+        let mut slow = link(25_000.0, 0.02);
+        run(&mut slow, &mut congestion, Time(0), Duration::from_secs(10));
+        let mut fast = link(625_000.0, 0.02);
+        let later = Time(0) + Duration::from_secs(10);
+        run(&mut fast, &mut congestion, later, Duration::from_secs(2));
+        assert!(congestion.bytes_per_second > 400_000.0, "{congestion:?}");
+    }
+
+    #[test]
+    fn random_loss_does_not_stop_the_path() {
+        let mut congestion = Congestion::new(Time(0));
+        let mut radio = link(625_000.0, 0.0);
+        run(&mut radio, &mut congestion, Time(0), Duration::from_secs(5));
+        radio.loss = 0.33;
+        let later = Time(0) + Duration::from_secs(5);
+        run(&mut radio, &mut congestion, later, Duration::from_secs(3));
+        let at = later + Duration::from_secs(3);
+        let used = run(&mut radio, &mut congestion, at, Duration::from_secs(5));
+        assert!(used > 0.6 * 625_000.0, "{used}");
+    }
+
+    #[test]
+    fn silence_slows_down_and_a_report_restores() {
+        let mut congestion = Congestion::new(Time(0));
+        for ms in (0..10_000).step_by(100) {
+            congestion.handle_silence(Time(0), Duration::from_millis(20), Time(ms * 1_000_000));
+        }
+        assert_eq!(congestion.rate(), 60_000);
+        let progress = Progress {
+            span: Duration::from_millis(50),
+            received: 4,
+            missing: 0,
+            bytes: 4_000,
+        };
+        let now = Time(10_000_000_000);
+        congestion.handle_report(&progress, Duration::ZERO, false, Duration::ZERO, now);
+        assert_eq!(congestion.rate(), 6_250_000);
+    }
+
+    #[test]
+    fn reports_come_round() {
+        let last = ReportEntry {
+            path: 1,
+            highest: u32::MAX,
+            received: u32::MAX - 1,
+            bytes: u32::MAX,
+            delay_us: 7,
+            at_us: u32::MAX - 999,
+            longest: 1200,
+        };
+        let next = ReportEntry {
+            highest: 9,
+            received: 3,
+            bytes: 99,
+            delay_us: u32::MAX,
+            at_us: 0,
+            ..last
+        };
+        let progress = Progress::between(&last, &next).unwrap();
+        assert_eq!((progress.received, progress.missing), (5, 5));
+        assert_eq!(
+            (progress.bytes, progress.span),
+            (100, Duration::from_millis(1))
+        );
+        assert_eq!(Progress::between(&next, &last), None);
+    }
+
+    #[test]
+    fn the_queue_is_what_is_longer_than_the_least_of_late() {
+        let report = |number: u32, delay_us: u32| ReportEntry {
+            path: 1,
+            highest: number,
+            received: number,
+            bytes: number * 1_000,
+            delay_us,
+            at_us: number * 1_000,
+            longest: 1_000,
+        };
+        let mut reporter = Reporter::new(report(1, 1_000), Time(0));
+        let mut queue = |number, delay_us, s: u64| {
+            let at = Time(s * 1_000_000_000);
+            let heard = reporter.handle_report(&report(number, delay_us), at);
+            heard.unwrap().1.as_micros()
+        };
+        assert_eq!(queue(2, 1_400, 1), 400);
+        assert_eq!(queue(3, 800, 2), 0);
+        assert_eq!(queue(4, u32::MAX - 99, 3), 0, "below zero");
+        assert_eq!(queue(5, 900, 4), 1_000);
+        // Forgotten after twenty seconds.
+        assert_eq!(queue(6, 900, 30), 1_000);
+        assert_eq!(queue(7, 900, 60), 0);
+    }
+}

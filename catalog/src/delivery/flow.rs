@@ -1,0 +1,247 @@
+//! One stream on one path: what has gone, what waits in the store, and what is on its way.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ddx_wire::sample::SampleMeta;
+use ddx_wire::{Contract, Delivery, Epoch, Priority, Seq, Time};
+
+use super::transfer::Transfer;
+use super::{Want, key};
+
+#[derive(Debug)]
+pub(super) struct Flow<P> {
+    pub(super) contract: Contract,
+    /// Turns are taken in the order of this: bytes sent, divided by the weight.
+    pub(super) turn: u64,
+    progress: Progress,
+    /// Since when something newer waits in the store.
+    pub(super) waits: Option<Time>,
+    /// A reader needs the newest sample again.
+    pub(super) urgent: bool,
+    /// Samples that were asked for again, in order.
+    gaps: VecDeque<Gap>,
+    /// Large samples, the newest last.
+    pub(super) transfers: VecDeque<Transfer<P>>,
+}
+
+/// How far a flow has got.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Progress {
+    /// Newest sample that was sent, or begun.
+    newest: Option<SampleMeta>,
+    /// Samples of the epoch that were left out here alone.
+    left_out: u64,
+}
+
+/// Samples of one epoch that a reader lacks.
+#[derive(Debug, PartialEq, Eq)]
+struct Gap {
+    epoch: Epoch,
+    first: Seq,
+    last: Seq,
+    /// Only these parts of the one sample: offset and length.
+    parts: Vec<(u32, u32)>,
+}
+
+impl<P: AsRef<[u8]>> Flow<P> {
+    pub(super) fn new(contract: Contract, turn: u64) -> Self {
+        Self {
+            contract,
+            turn,
+            progress: Progress::default(),
+            waits: None,
+            urgent: false,
+            gaps: VecDeque::new(),
+            transfers: VecDeque::new(),
+        }
+    }
+
+    pub(super) fn is_every(&self) -> bool {
+        self.contract.delivery != Delivery::Latest
+    }
+
+    pub(super) fn is_command(&self) -> bool {
+        self.contract.priority == Priority::Command
+    }
+
+    /// Whether something must be read from the store.
+    pub(super) fn wants_fetch(&self) -> bool {
+        let busy = self.is_under_way();
+        self.urgent || (!busy && (self.waits.is_some() || !self.gaps.is_empty()))
+    }
+
+    pub(super) fn is_under_way(&self) -> bool {
+        self.transfers.iter().any(Transfer::is_under_way)
+    }
+
+    pub(super) fn repairs(&self) -> bool {
+        self.transfers.iter().any(Transfer::repairs)
+    }
+
+    /// What to read from the store next.
+    ///
+    /// The flag tells whether it was sent before.
+    pub(super) fn fetch(&mut self, now: Time) -> Option<(Want, bool)> {
+        if std::mem::take(&mut self.urgent) {
+            return Some((Want::Newest, true));
+        }
+        if let Some(gap) = self.gaps.front() {
+            return Some((Want::At(gap.epoch, gap.first), true));
+        }
+        let since = self.waits.take()?;
+        let want = match self.sent() {
+            // A burst goes out in order; on a path that is too slow the newest is worth more.
+            Some((epoch, seq)) if self.is_every() || now.since(since) < BURST => {
+                Want::After(epoch, seq)
+            }
+            Some(_) | None => Want::Newest,
+        };
+        // Still so until the answer says that nothing is left.
+        self.waits = Some(since);
+        Some((want, false))
+    }
+
+    /// Notes that a sample goes out now, and says how many of its epoch were left out before it: for all paths, as `meta`
+    /// says, and here, because the path was too slow.
+    pub(super) fn pass(&mut self, meta: &SampleMeta) -> u64 {
+        let here = match self.progress.newest {
+            Some(last) if key(&last) >= key(meta) => return self.filtered(meta),
+            // Of an item whose every sample is wanted none is left out on purpose.
+            Some(_) if self.is_every() => 0,
+            Some(last) => {
+                let (seq, filtered) = if last.epoch == meta.epoch {
+                    (last.seq.0, last.filtered)
+                } else {
+                    self.progress.left_out = 0;
+                    (0, 0)
+                };
+                let gap = meta.seq.0.saturating_sub(seq).saturating_sub(1);
+                gap.saturating_sub(meta.filtered.saturating_sub(filtered))
+            }
+            None => 0,
+        };
+        self.progress.left_out = self.progress.left_out.saturating_add(here);
+        self.progress.newest = Some(*meta);
+        self.filtered(meta)
+    }
+
+    /// How many were left out so far, for a sample that goes out once more.
+    pub(super) fn filtered(&self, meta: &SampleMeta) -> u64 {
+        let left_out = meta.filtered.saturating_add(self.progress.left_out);
+        left_out.min(meta.seq.0.saturating_sub(1))
+    }
+
+    /// Newest sample that was sent here, or begun.
+    pub(super) fn sent(&self) -> Option<(Epoch, Seq)> {
+        self.progress.newest.as_ref().map(key)
+    }
+
+    /// How far it has got, for a flow that goes on elsewhere.
+    pub(super) fn progress(&self) -> Progress {
+        self.progress
+    }
+
+    /// Goes on where another flow of the stream is.
+    pub(super) fn follow(&mut self, progress: Progress, newest: Option<(Epoch, Seq)>, now: Time) {
+        self.progress = progress;
+        let waits = progress.newest.is_some() && self.sent() < newest;
+        self.waits = waits.then_some(now);
+    }
+
+    /// Its samples go another way from now on.
+    pub(super) fn rest(&mut self) {
+        self.progress = Progress::default();
+        self.waits = None;
+    }
+
+    /// Queues samples for repair; those beyond the limit are asked for again by their reader.
+    pub(super) fn add_gap(&mut self, epoch: Epoch, first: Seq, count: u32, parts: &[(u32, u32)]) {
+        let last = Seq(first.0.saturating_add(u64::from(count.max(1)) - 1));
+        let gap = Gap {
+            epoch,
+            first,
+            last,
+            parts: parts.to_vec(),
+        };
+        let known = self.gaps.iter().any(|known| {
+            known.epoch == epoch
+                && known.first <= first
+                && last <= known.last
+                && known.parts == gap.parts
+        });
+        if !known && self.gaps.len() < GAPS {
+            self.gaps.push_back(gap);
+        }
+    }
+
+    /// The store gave `found` for the first sample of the first gap; `None` is nothing newer either. Returns how many
+    /// samples are gone before it, the parts that are wanted, and whether it is wanted at all.
+    pub(super) fn fill(&mut self, found: Option<(Epoch, Seq)>) -> Option<Filled> {
+        let gap = self.gaps.front_mut()?;
+        let gone_until = match found {
+            Some((epoch, seq)) if epoch == gap.epoch => seq.0.saturating_sub(1).min(gap.last.0),
+            Some(_) | None => gap.last.0,
+        };
+        let gone = (gone_until + 1).saturating_sub(gap.first.0);
+        let epoch = gap.epoch;
+        let wanted = found.filter(|(at, seq)| *at == epoch && *seq <= gap.last);
+        let parts = std::mem::take(&mut gap.parts);
+        gap.first = Seq(wanted.map_or(gap.last.0, |(_, seq)| seq.0) + 1);
+        if gap.first > gap.last {
+            self.gaps.pop_front();
+        }
+        Some(Filled {
+            epoch,
+            gone,
+            gone_until: Seq(gone_until),
+            wanted: wanted.is_some(),
+            parts,
+        })
+    }
+
+    /// Keeps a large sample for its repair, and drops those that nobody waits for any more.
+    pub(super) fn begin(&mut self, transfer: Transfer<P>) {
+        let kept = if self.is_every() { KEPT_EVERY } else { KEPT };
+        while self.transfers.len() >= kept {
+            self.transfers.pop_front();
+        }
+        self.transfers.push_back(transfer);
+    }
+
+    /// The transfer of that sample, while it is kept.
+    pub(super) fn transfer(&mut self, at: (Epoch, Seq)) -> Option<&mut Transfer<P>> {
+        self.transfers
+            .iter_mut()
+            .find(|transfer| transfer.key() == at)
+    }
+
+    /// Drops the samples that every reader holds.
+    pub(super) fn release(&mut self, held: (Epoch, Seq)) {
+        self.transfers.retain(|transfer| {
+            transfer.key() > held || transfer.is_under_way() || transfer.repairs()
+        });
+    }
+}
+
+/// What came of a gap.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Filled {
+    pub(super) epoch: Epoch,
+    /// Samples that cannot be had any more, up to `gone_until`.
+    pub(super) gone: u64,
+    pub(super) gone_until: Seq,
+    /// Whether the sample that was found closes the gap, or a part of it.
+    pub(super) wanted: bool,
+    /// The parts of it that are wanted; none is all.
+    pub(super) parts: Vec<(u32, u32)>,
+}
+
+/// How long the samples of a burst wait their turn before the newest alone counts.
+const BURST: Duration = Duration::from_millis(20);
+/// Gaps of one stream on one path that wait for repair.
+const GAPS: usize = 256;
+/// Large samples kept for repair: the one under way, and the one before.
+const KEPT: usize = 2;
+/// The same where each sample is wanted.
+const KEPT_EVERY: usize = 4;

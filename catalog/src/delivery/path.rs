@@ -1,0 +1,665 @@
+//! One destination: its rate, its three lanes, and the streams that share it.
+//!
+//! Next to nothing is queued here: what the path cannot take now stays in the store, and is read again when it can, the
+//! newest first. Streams take turns by weight, counted in bytes.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ddx_wire::message::ReportEntry;
+use ddx_wire::sample::{FRAGMENT_RECORD_BYTES, Preamble, RECORD_BYTES, Record, SampleMeta};
+use ddx_wire::seal::{Lane, Sealer};
+use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
+
+use super::congestion::{Congestion, Reporter};
+use super::flow::{Flow, Progress};
+use super::pace::{Pace, batch_bytes};
+use super::queue::{DATAGRAM_OVERHEAD, Limit, Queue};
+use super::sender::FIRST_UNICAST;
+use super::transfer::Transfer;
+use super::{Fetch, PathStatus, Transmit, Want};
+
+/// A destination of datagrams.
+#[derive(Debug)]
+pub(super) struct Path<P> {
+    addr: SocketAddr,
+    number: u16,
+    datagrams: u32,
+    datagram_bytes: usize,
+    /// What gets through everywhere.
+    datagram_bytes_safe: usize,
+    datagram_bytes_max: usize,
+    segments_max: usize,
+    pace: Pace,
+    congestion: Congestion,
+    lanes: [Queue; LANES.len()],
+    flows: BTreeMap<StreamId, Flow<P>>,
+    /// Flows that want something from the store, by turn.
+    hungry: BTreeSet<(u64, StreamId)>,
+    /// Flows with fragments that were never sent, by turn.
+    sending: BTreeSet<(u64, StreamId)>,
+    /// Flows with fragments that are asked for again, by turn.
+    repairing: BTreeSet<(u64, StreamId)>,
+    /// The turn that was taken last: who was idle begins here.
+    turn: u64,
+    round_trip: Duration,
+    reporters: BTreeMap<Tag, Reporter>,
+    unreported_bytes: usize,
+    unreported_since: Time,
+    probe_at: Time,
+    /// Who holds what of the streams is known by the sender; large samples that left in full are told to it.
+    left: Vec<(StreamId, Epoch, Seq)>,
+}
+
+/// What became of a sample that was offered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Offered {
+    /// It is about to leave.
+    Goes,
+    /// Its first fragments are about to leave; the rest follows.
+    Begins,
+    /// It stays in the store until the path has room.
+    Waits,
+}
+
+/// What limits a path.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PathLimits {
+    pub(super) datagram_bytes: usize,
+    pub(super) datagram_bytes_max: usize,
+    pub(super) segments_max: usize,
+}
+
+impl<P: AsRef<[u8]> + Clone> Path<P> {
+    pub(super) fn new(addr: SocketAddr, number: u16, limits: PathLimits, now: Time) -> Self {
+        Self {
+            addr,
+            number,
+            datagrams: 0,
+            datagram_bytes: limits.datagram_bytes,
+            datagram_bytes_safe: limits.datagram_bytes,
+            datagram_bytes_max: limits.datagram_bytes_max,
+            segments_max: limits.segments_max,
+            pace: Pace::new(now),
+            congestion: Congestion::new(now),
+            lanes: Default::default(),
+            flows: BTreeMap::new(),
+            hungry: BTreeSet::new(),
+            sending: BTreeSet::new(),
+            repairing: BTreeSet::new(),
+            turn: 0,
+            round_trip: Duration::from_millis(50),
+            reporters: BTreeMap::new(),
+            unreported_bytes: 0,
+            unreported_since: now,
+            probe_at: now,
+            left: Vec::new(),
+        }
+    }
+
+    pub(super) fn number(&self) -> u16 {
+        self.number
+    }
+
+    pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
+        self.round_trip = round_trip;
+    }
+
+    pub(super) fn status(&self) -> PathStatus {
+        PathStatus {
+            to: self.addr,
+            bytes_per_second: self.congestion.rate(),
+            queue: self.congestion.queue(),
+            loss_permille: self.congestion.loss_permille(),
+            datagram_bytes: self.datagram_bytes,
+            waiting: self.hungry.len() + self.sending.len(),
+        }
+    }
+
+    /// Opens a flow, or changes its contract.
+    pub(super) fn open(&mut self, stream: StreamId, contract: Contract) {
+        let turn = self.turn;
+        let flow = self.flows.entry(stream);
+        flow.or_insert_with(|| Flow::new(contract, turn)).contract = contract;
+    }
+
+    /// How far a stream has got here.
+    pub(super) fn progress(&self, stream: StreamId) -> Option<Progress> {
+        self.flows.get(&stream).map(Flow::progress)
+    }
+
+    /// A stream goes on here from where it is elsewhere.
+    pub(super) fn follow(
+        &mut self,
+        stream: StreamId,
+        progress: Progress,
+        newest: Option<(Epoch, Seq)>,
+        now: Time,
+    ) {
+        self.forget_turns(stream);
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            flow.follow(progress, newest, now);
+        }
+        self.take_turns(stream);
+    }
+
+    /// A stream takes another way from now on; only repairs still go here.
+    pub(super) fn rest(&mut self, stream: StreamId) {
+        self.forget_turns(stream);
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            flow.rest();
+        }
+        self.take_turns(stream);
+    }
+
+    pub(super) fn close(&mut self, stream: StreamId) {
+        self.flows.remove(&stream);
+        for turns in [&mut self.hungry, &mut self.sending, &mut self.repairing] {
+            turns.retain(|(_, id)| *id != stream);
+        }
+    }
+
+    /// Drops the flows of other streams.
+    pub(super) fn keep(&mut self, keep: impl Fn(StreamId) -> bool) {
+        let gone = self.flows.keys().copied().filter(|stream| !keep(*stream));
+        for stream in gone.collect::<Vec<_>>() {
+            self.close(stream);
+        }
+    }
+
+    /// Whether nobody uses the path any longer, nor waits for what it has.
+    pub(super) fn is_unused(&self) -> bool {
+        self.flows.is_empty() && self.lanes.iter().all(Queue::is_empty)
+    }
+
+    /// Offers a new sample of a stream.
+    pub(super) fn offer(
+        &mut self,
+        stream: StreamId,
+        meta: &SampleMeta,
+        payload: &P,
+        now: Time,
+    ) -> Offered {
+        let rate = self.congestion.rate();
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return Offered::Goes;
+        };
+        if flow.sent() >= Some((meta.epoch, meta.seq)) {
+            // It went to a new reader out of turn.
+            return Offered::Goes;
+        }
+        // The value that a new reader wants is on its way with this one.
+        self.forget_turns(stream);
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return Offered::Goes;
+        };
+        if flow.waits.is_none() {
+            flow.urgent = false;
+        }
+        self.take_turns(stream);
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return Offered::Goes;
+        };
+        if flow.waits.is_some() {
+            return Offered::Waits;
+        }
+        let len = payload.as_ref().len();
+        let large = DATAGRAM_OVERHEAD + RECORD_BYTES + len > self.datagram_bytes;
+        let lane = lane_of(flow.is_command(), false);
+        let full = if large {
+            flow.is_under_way()
+        } else {
+            let queue = &self.lanes[lane];
+            queue.len() >= room(rate) && !queue.has_company(RECORD_BYTES + len, self.datagram_bytes)
+        };
+        if full {
+            flow.waits = Some(now);
+            self.hungry.insert((flow.turn, stream));
+            return Offered::Waits;
+        }
+        self.admit(stream, meta, payload, None, now)
+    }
+
+    /// Takes what a [`Fetch`] brought, or that there is nothing.
+    pub(super) fn fetched(
+        &mut self,
+        fetch: &Fetch,
+        found: Option<(&SampleMeta, &P)>,
+        newest: Option<(Epoch, Seq)>,
+        now: Time,
+    ) -> Option<Offered> {
+        let stream = fetch.stream;
+        self.forget_turns(stream);
+        let flow = self.flows.get_mut(&stream)?;
+        let mut offered = None;
+        if let Want::At(..) = fetch.want {
+            let filled = flow.fill(found.map(|(meta, _)| (meta.epoch, meta.seq)))?;
+            if filled.gone > 0 {
+                let meta = SampleMeta {
+                    epoch: filled.epoch,
+                    seq: filled.gone_until,
+                    ..SampleMeta::default()
+                };
+                self.push_gone(stream, &meta, filled.gone);
+            }
+            if filled.wanted
+                && let Some((meta, payload)) = found
+            {
+                offered = Some(self.admit(stream, meta, payload, Some(&filled.parts), now));
+            }
+        } else if let Some((meta, payload)) = found {
+            let at = (meta.epoch, meta.seq);
+            if fetch.again {
+                offered = Some(self.admit(stream, meta, payload, Some(&[]), now));
+            } else if flow.sent() >= Some(at) {
+                flow.waits = None;
+            } else {
+                // Where each sample is wanted, what the ring let go is told.
+                if let (true, Some((epoch, Seq(last)))) = (flow.is_every(), flow.sent())
+                    && epoch == meta.epoch
+                    && meta.seq.0 > last + 1
+                {
+                    let gone = SampleMeta {
+                        epoch,
+                        seq: Seq(meta.seq.0 - 1),
+                        ..SampleMeta::default()
+                    };
+                    let count = meta.seq.0 - last - 1;
+                    self.push_gone(stream, &gone, count);
+                }
+                offered = Some(self.admit(stream, meta, payload, None, now));
+            }
+            if let Some(flow) = self.flows.get_mut(&stream)
+                && flow.sent() >= newest
+            {
+                flow.waits = None;
+            }
+        } else {
+            flow.waits = None;
+        }
+        self.take_turns(stream);
+        offered
+    }
+
+    /// A reader here needs the newest sample again.
+    pub(super) fn repeat(&mut self, stream: StreamId, newest: Option<(Epoch, Seq)>) {
+        self.forget_turns(stream);
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return;
+        };
+        match newest.and_then(|at| flow.transfer(at)) {
+            Some(transfer) if transfer.is_under_way() => {}
+            Some(transfer) => transfer.ask_last(),
+            None => flow.urgent = true,
+        }
+        self.take_turns(stream);
+    }
+
+    /// A reader lacks samples.
+    pub(super) fn handle_gap(&mut self, stream: StreamId, epoch: Epoch, first: Seq, count: u32) {
+        self.forget_turns(stream);
+        if let Some(flow) = self.flows.get_mut(&stream)
+            && flow.is_every()
+        {
+            flow.add_gap(epoch, first, count, &[]);
+        }
+        self.take_turns(stream);
+    }
+
+    /// A reader lacks parts of a sample. Whether it will get them.
+    pub(super) fn handle_parts(
+        &mut self,
+        stream: StreamId,
+        at: (Epoch, Seq),
+        parts: &[(u32, u32)],
+        is_newest: bool,
+        now: Time,
+    ) -> bool {
+        self.forget_turns(stream);
+        let round_trip = self.round_trip;
+        let mut answered = true;
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            if let Some(transfer) = flow.transfer(at) {
+                for (offset, len) in parts {
+                    transfer.ask(*offset, *len, round_trip, now);
+                }
+            } else if flow.is_every() || is_newest {
+                // It went another way, or long ago.
+                flow.add_gap(at.0, at.1, 1, parts);
+            } else {
+                answered = false;
+            }
+        }
+        self.take_turns(stream);
+        answered
+    }
+
+    /// Every reader here holds a sample.
+    pub(super) fn release(&mut self, stream: StreamId, held: (Epoch, Seq)) {
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            flow.release(held);
+        }
+    }
+
+    /// Takes in how datagrams arrive.
+    pub(super) fn handle_report(&mut self, from: Tag, report: &ReportEntry, now: Time) {
+        let longest = usize::from(report.longest).min(self.datagram_bytes_max);
+        if self.number >= FIRST_UNICAST {
+            self.datagram_bytes = self.datagram_bytes.max(longest);
+        }
+        self.unreported_bytes = 0;
+        let Some(reporter) = self.reporters.get_mut(&from) else {
+            self.reporters.insert(from, Reporter::new(*report, now));
+            return;
+        };
+        if let Some((progress, queue)) = reporter.handle_report(report, now) {
+            let limited = self.pace.take_limited();
+            self.congestion
+                .handle_report(&progress, queue, limited, self.round_trip, now);
+        }
+    }
+
+    /// Forgets the reports of readers that are gone.
+    pub(super) fn keep_readers(&mut self, keep: &BTreeSet<Tag>) {
+        self.reporters.retain(|reader, _| keep.contains(reader));
+    }
+
+    /// The next thing to read from the store, if there is room for it.
+    pub(super) fn poll_fetch(&mut self, now: Time) -> Option<Fetch> {
+        let rate = self.congestion.rate();
+        let (turn, stream) = *self.hungry.first()?;
+        let flow = self.flows.get_mut(&stream)?;
+        let lane = lane_of(flow.is_command(), flow.urgent);
+        if self.lanes[lane].len() >= room(rate) {
+            return None;
+        }
+        self.hungry.remove(&(turn, stream));
+        let (want, again) = flow.fetch(now)?;
+        Some(Fetch {
+            stream,
+            to: self.addr,
+            want,
+            again,
+        })
+    }
+
+    /// No datagram waits for company any longer, unless the rate holds it back anyway.
+    pub(super) fn flush(&mut self, now: Time) {
+        let backlog = self.lanes.iter().any(|queue| !queue.is_empty());
+        if backlog && self.pace.blocked_until(now).is_none() {
+            self.lanes.iter_mut().for_each(Queue::close);
+        }
+    }
+
+    /// Whether something could leave, now or once the rate allows.
+    pub(super) fn is_ready(&self) -> bool {
+        !self.sending.is_empty()
+            || !self.repairing.is_empty()
+            || self.lanes.iter().any(|queue| !queue.is_empty())
+    }
+
+    /// When something can leave, if that is later than `now`.
+    pub(super) fn blocked_until(&mut self, now: Time) -> Option<Time> {
+        self.pace.blocked_until(now)
+    }
+
+    /// Most urgent lane that has something, as a rank: 0 is first.
+    pub(super) fn rank(&self) -> Option<usize> {
+        let queued = self.lanes.iter().position(Queue::is_ready);
+        let waiting = if !self.repairing.is_empty() {
+            Some(0)
+        } else if !self.sending.is_empty() {
+            Some(2)
+        } else {
+            None
+        };
+        queued.into_iter().chain(waiting).min()
+    }
+
+    /// Seals the next batch into `out`.
+    pub(super) fn poll_transmit(
+        &mut self,
+        sealer: &mut Sealer,
+        out: &mut Vec<u8>,
+        now: Time,
+    ) -> Option<Transmit> {
+        let rank = self.rank()?;
+        let rate = self.congestion.rate();
+        let limit = Limit {
+            segments: self.segments_max,
+            bytes: batch_bytes(rate).min(BATCH_BYTES),
+        };
+        if !self.lanes[rank].is_ready() {
+            self.cut(rank, limit, now);
+        }
+        let micros = now.0 / 1_000;
+        let mut preamble = Preamble {
+            path: self.number,
+            number: self.datagrams,
+            sent_us: u32::try_from(micros & u64::from(u32::MAX)).unwrap_or_default(),
+            is_probe: false,
+        };
+        let first = self.lanes[rank].pop(LANES[rank], sealer, limit, &mut preamble, out);
+        self.datagrams = preamble.number;
+        if first == 0 {
+            return None;
+        }
+        self.pace.spend(out.len(), rate, now);
+        if self.unreported_bytes == 0 {
+            self.unreported_since = now;
+        }
+        self.unreported_bytes += out.len();
+        let silent = self.unreported_bytes > SILENT_BYTES;
+        if silent
+            && self
+                .congestion
+                .handle_silence(self.unreported_since, self.round_trip, now)
+        {
+            // Perhaps the way became one for shorter datagrams.
+            self.datagram_bytes = self.datagram_bytes.min(self.datagram_bytes_safe);
+        }
+        let segment = (out.len() > first)
+            .then(|| u16::try_from(first).ok())
+            .flatten();
+        Some(Transmit {
+            to: self.addr,
+            segment,
+        })
+    }
+
+    /// Large samples that left in full since the last call.
+    pub(super) fn take_left(&mut self) -> Vec<(StreamId, Epoch, Seq)> {
+        std::mem::take(&mut self.left)
+    }
+
+    /// Cuts the next fragments into datagrams: a batch of one stream, or what is asked for again.
+    fn cut(&mut self, rank: usize, limit: Limit, now: Time) {
+        let repairs = rank == 0;
+        let turns = if repairs {
+            &self.repairing
+        } else {
+            &self.sending
+        };
+        let Some(&(_, stream)) = turns.first() else {
+            return;
+        };
+        self.forget_turns(stream);
+        let datagram_bytes = self.datagram_bytes;
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            let queue = &mut self.lanes[rank];
+            let wanted = |transfer: &&mut Transfer<P>| match repairs {
+                true => transfer.repairs(),
+                false => transfer.is_under_way(),
+            };
+            let mut cut_bytes = 0;
+            if let Some(transfer) = flow.transfers.iter_mut().find(wanted) {
+                let (meta, again) = (*transfer.meta(), repairs || transfer.is_again());
+                for _ in 0..limit.segments {
+                    let next = match repairs {
+                        true => transfer.next_repair(now),
+                        false => transfer.next_fragment(now),
+                    };
+                    let Some((fragment, payload)) = next else {
+                        break;
+                    };
+                    let record = Record {
+                        stream,
+                        repeat: again,
+                        gone: false,
+                        meta,
+                        fragment: Some(fragment),
+                        payload,
+                    };
+                    queue.close();
+                    queue.push(&record, datagram_bytes);
+                    cut_bytes += record.encoded_len();
+                    if queue.len() >= limit.bytes {
+                        break;
+                    }
+                }
+                queue.close();
+                if !repairs && !transfer.is_under_way() {
+                    self.left.push((stream, meta.epoch, meta.seq));
+                }
+            }
+            self.turn = flow.turn;
+            flow.turn += charge(cut_bytes, flow.contract);
+        }
+        self.take_turns(stream);
+    }
+
+    /// Queues a sample, or begins with its fragments. `again` holds the parts that are wanted of one that was sent before;
+    /// none of them is all.
+    fn admit(
+        &mut self,
+        stream: StreamId,
+        meta: &SampleMeta,
+        payload: &P,
+        again: Option<&[(u32, u32)]>,
+        now: Time,
+    ) -> Offered {
+        self.forget_turns(stream);
+        let large = DATAGRAM_OVERHEAD + RECORD_BYTES + payload.as_ref().len() > self.datagram_bytes;
+        if large {
+            self.probe(now);
+        }
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return Offered::Goes;
+        };
+        let filtered = match again {
+            Some(_) if flow.sent() >= Some((meta.epoch, meta.seq)) => flow.filtered(meta),
+            Some(_) | None => flow.pass(meta),
+        };
+        let meta = SampleMeta { filtered, ..*meta };
+        let bytes = payload.as_ref();
+        flow.turn = flow.turn.max(self.turn);
+        let offered = if large {
+            let step = self.datagram_bytes - DATAGRAM_OVERHEAD - FRAGMENT_RECORD_BYTES;
+            let transfer = Transfer::new(meta, payload.clone(), step, now);
+            flow.begin(match again {
+                Some(parts) => transfer.again(parts, now),
+                None => transfer,
+            });
+            Offered::Begins
+        } else {
+            let record = Record {
+                stream,
+                repeat: again.is_some(),
+                gone: false,
+                meta,
+                fragment: None,
+                payload: bytes,
+            };
+            let lane = lane_of(flow.is_command(), again.is_some());
+            self.turn = flow.turn;
+            flow.turn += charge(record.encoded_len(), flow.contract);
+            self.lanes[lane].push(&record, self.datagram_bytes);
+            Offered::Goes
+        };
+        self.take_turns(stream);
+        offered
+    }
+
+    /// Tries, now and then, whether longer datagrams get through to the one host at the other end.
+    fn probe(&mut self, now: Time) {
+        if self.number < FIRST_UNICAST || now < self.probe_at {
+            return;
+        }
+        self.probe_at = now + PROBE_PAUSE;
+        let lengths = [ETHERNET_BYTES, self.datagram_bytes_max];
+        for len in lengths.map(|len| len.min(self.datagram_bytes_max)) {
+            if len <= self.datagram_bytes {
+                continue;
+            }
+            self.lanes[0].push_padding(len);
+        }
+    }
+
+    fn push_gone(&mut self, stream: StreamId, meta: &SampleMeta, count: u64) {
+        let others = count.saturating_sub(1).to_le_bytes();
+        let record = Record {
+            stream,
+            repeat: true,
+            gone: true,
+            meta: *meta,
+            fragment: None,
+            payload: &others,
+        };
+        self.lanes[0].push(&record, self.datagram_bytes);
+    }
+
+    fn forget_turns(&mut self, stream: StreamId) {
+        if let Some(flow) = self.flows.get(&stream) {
+            let entry = (flow.turn, stream);
+            self.hungry.remove(&entry);
+            self.sending.remove(&entry);
+            self.repairing.remove(&entry);
+        }
+    }
+
+    fn take_turns(&mut self, stream: StreamId) {
+        if let Some(flow) = self.flows.get(&stream) {
+            let entry = (flow.turn, stream);
+            if flow.wants_fetch() {
+                self.hungry.insert(entry);
+            }
+            if flow.is_under_way() {
+                self.sending.insert(entry);
+            }
+            if flow.repairs() {
+                self.repairing.insert(entry);
+            }
+        }
+    }
+}
+
+/// What a flow pays for bytes: the more weight, the less.
+fn charge(bytes: usize, contract: Contract) -> u64 {
+    let bytes = u64::try_from(bytes).unwrap_or(u64::MAX);
+    bytes.saturating_mul(WEIGHT_UNIT) / u64::from(contract.priority.weight().max(1))
+}
+
+fn lane_of(command: bool, again: bool) -> usize {
+    if command || again { 0 } else { 1 }
+}
+
+/// Bytes that may wait in one lane: what the rate sends in 4 ms, and at least the datagram that is being filled.
+fn room(rate: u64) -> usize {
+    usize::try_from(rate / 250).map_or(ROOM_MAX, |bytes| bytes.clamp(1, ROOM_MAX))
+}
+
+/// The lanes of samples, most urgent first.
+const LANES: [Lane; 3] = [Lane::Commands, Lane::Values, Lane::Bulk];
+/// `PROTOCOL.md#limits`: what one segmented send of the kernel takes.
+const BATCH_BYTES: usize = 60_000;
+/// `PROTOCOL.md#limits`: bytes queued in one lane of one path.
+const ROOM_MAX: usize = 256 << 10;
+/// `PROTOCOL.md#limits`: the first length that is tried: what an Ethernet frame of 1,500 bytes carries.
+const ETHERNET_BYTES: usize = 1_472;
+/// Time between two tries.
+const PROBE_PAUSE: Duration = Duration::from_secs(10);
+/// So much may be sent without a report before their absence means something: receivers report each 2 KiB.
+const SILENT_BYTES: usize = 16 << 10;
+/// Keeps the quotient of [`charge`] exact for all weights.
+const WEIGHT_UNIT: u64 = 16;

@@ -1,0 +1,173 @@
+//! Datagrams of one lane of one path that are about to leave.
+//!
+//! They lie back to back in one buffer, so that in steady state nothing is allocated for a sample. They are numbered and
+//! sealed when they leave.
+
+use std::collections::VecDeque;
+
+use ddx_wire::StreamId;
+use ddx_wire::sample::{PREAMBLE_BYTES, Preamble, Record};
+use ddx_wire::seal::{HEADER_BYTES, Lane, MIXED_STREAMS, SEAL_BYTES, Sealer};
+
+/// What every data datagram costs beside its records, bytes.
+pub(super) const DATAGRAM_OVERHEAD: usize = HEADER_BYTES + PREAMBLE_BYTES + SEAL_BYTES;
+
+#[derive(Debug, Default)]
+pub(super) struct Queue {
+    bytes: Vec<u8>,
+    /// Where the first datagram that has not left begins.
+    head: usize,
+    closed: VecDeque<Closed>,
+    open: Option<Open>,
+}
+
+#[derive(Debug)]
+struct Closed {
+    len: usize,
+    stream: StreamId,
+}
+
+#[derive(Debug)]
+struct Open {
+    start: usize,
+    stream: StreamId,
+}
+
+/// What bounds one batch.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Limit {
+    /// Datagrams.
+    pub(super) segments: usize,
+    /// Bytes; one datagram may always go.
+    pub(super) bytes: usize,
+}
+
+impl Queue {
+    /// Bytes that wait, as they will be on the wire.
+    pub(super) fn len(&self) -> usize {
+        let datagrams = self.closed.len() + usize::from(self.open.is_some());
+        self.bytes.len() - self.head + datagrams * SEAL_BYTES
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.closed.is_empty() && self.open.is_none()
+    }
+
+    /// Whether a datagram may leave.
+    pub(super) fn is_ready(&self) -> bool {
+        !self.closed.is_empty()
+    }
+
+    /// Whether a record of this length fits the datagram that waits for company.
+    pub(super) fn has_company(&self, len: usize, datagram_bytes: usize) -> bool {
+        self.open
+            .as_ref()
+            .is_some_and(|open| self.bytes.len() - open.start + len + SEAL_BYTES <= datagram_bytes)
+    }
+
+    /// Adds a record to the open datagram, or to a new one where it does not fit.
+    pub(super) fn push(&mut self, record: &Record<'_>, datagram_bytes: usize) {
+        if !self.has_company(record.encoded_len(), datagram_bytes) {
+            self.close();
+        }
+        match &mut self.open {
+            Some(open) if open.stream == record.stream => {}
+            Some(open) => open.stream = MIXED_STREAMS,
+            None => {
+                let start = self.bytes.len();
+                self.bytes.resize(start + HEADER_BYTES + PREAMBLE_BYTES, 0);
+                self.open = Some(Open {
+                    start,
+                    stream: record.stream,
+                });
+            }
+        }
+        // Cannot fail: what cannot be encoded is refused before it comes here.
+        record.encode(&mut self.bytes).ok();
+    }
+
+    /// Adds a datagram of exactly `len` bytes that carries nothing.
+    pub(super) fn push_padding(&mut self, len: usize) {
+        self.close();
+        let start = self.bytes.len();
+        self.bytes.resize(start + len.saturating_sub(SEAL_BYTES), 0);
+        self.closed.push_back(Closed {
+            len: self.bytes.len() - start,
+            stream: MIXED_STREAMS,
+        });
+    }
+
+    /// The open datagram waits for no more company.
+    pub(super) fn close(&mut self) {
+        if let Some(open) = self.open.take() {
+            self.closed.push_back(Closed {
+                len: self.bytes.len() - open.start,
+                stream: open.stream,
+            });
+        }
+    }
+
+    /// Seals the next batch into `out`: equal datagrams, the last perhaps shorter. Returns the length of the first, 0 for
+    /// none, and counts them in `preamble.number`.
+    pub(super) fn pop(
+        &mut self,
+        lane: Lane,
+        sealer: &mut Sealer,
+        limit: Limit,
+        preamble: &mut Preamble,
+        out: &mut Vec<u8>,
+    ) -> usize {
+        out.clear();
+        let mut first = 0;
+        for _ in 0..limit.segments {
+            let Some(next) = self.closed.front() else {
+                break;
+            };
+            let len = next.len + SEAL_BYTES;
+            if !out.is_empty() && (len > first || out.len() + len > limit.bytes) {
+                break;
+            }
+            if first == 0 {
+                first = len;
+            }
+            let start = out.len();
+            out.extend_from_slice(
+                self.bytes
+                    .get(self.head..self.head + next.len)
+                    .unwrap_or_default(),
+            );
+            preamble.number = preamble.number.wrapping_add(1);
+            let place = start + HEADER_BYTES;
+            if let Some(place) = out.get_mut(place..place + PREAMBLE_BYTES) {
+                place.copy_from_slice(&preamble.to_bytes());
+            }
+            if sealer.seal(lane, next.stream, out, start).is_err() {
+                // Only a worn-out incarnation cannot seal: it sends nothing more.
+                out.truncate(start);
+            }
+            self.head += next.len;
+            self.closed.pop_front();
+            if len < first {
+                break;
+            }
+        }
+        self.compact();
+        if out.is_empty() { 0 } else { first }
+    }
+
+    fn compact(&mut self) {
+        if self.is_empty() {
+            self.bytes.clear();
+            self.head = 0;
+        } else if self.head > COMPACT_BYTES {
+            self.bytes.drain(..self.head);
+            if let Some(open) = &mut self.open {
+                open.start -= self.head;
+            }
+            self.head = 0;
+        }
+    }
+}
+
+/// How much may have left a queue before what waits moves to the front of its buffer.
+const COMPACT_BYTES: usize = 65_536;

@@ -1,0 +1,184 @@
+//! One large sample on its way along one path: which fragments have left, and which are asked for again.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use ddx_wire::sample::{Fragment, SampleMeta};
+use ddx_wire::{Epoch, Seq, Time};
+
+use super::key;
+
+/// A sample in fragments, and the payload until nobody needs it any longer.
+#[derive(Debug)]
+pub(super) struct Transfer<P> {
+    meta: SampleMeta,
+    payload: P,
+    /// Payload bytes of each fragment but the last.
+    step: usize,
+    /// First fragment that was never sent.
+    next: usize,
+    /// Fragments to send again, in the order of the requests.
+    again: VecDeque<usize>,
+    /// When each fragment last left: milliseconds since `begun`, from 1; 0 is never.
+    left: Vec<u32>,
+    begun: Time,
+    again_all: bool,
+}
+
+impl<P: AsRef<[u8]>> Transfer<P> {
+    /// Begins with the first fragment.
+    pub(super) fn new(meta: SampleMeta, payload: P, step: usize, now: Time) -> Self {
+        let step = step.max(1);
+        let count = payload.as_ref().len().div_ceil(step);
+        Self {
+            meta,
+            payload,
+            step,
+            next: 0,
+            again: VecDeque::new(),
+            left: vec![0; count],
+            begun: now,
+            again_all: false,
+        }
+    }
+
+    /// Marks all as sent before, and sends only `parts`, offset and length, unless there are none.
+    pub(super) fn again(mut self, parts: &[(u32, u32)], now: Time) -> Self {
+        self.again_all = true;
+        if !parts.is_empty() {
+            self.next = self.left.len();
+            for (offset, len) in parts {
+                self.ask(*offset, *len, Duration::ZERO, now);
+            }
+        }
+        self
+    }
+
+    /// Whether the sample was sent before.
+    pub(super) fn is_again(&self) -> bool {
+        self.again_all
+    }
+
+    pub(super) fn key(&self) -> (Epoch, Seq) {
+        key(&self.meta)
+    }
+
+    pub(super) fn meta(&self) -> &SampleMeta {
+        &self.meta
+    }
+
+    /// Whether fragments wait that were never sent.
+    pub(super) fn is_under_way(&self) -> bool {
+        self.next < self.left.len()
+    }
+
+    /// Whether fragments wait that were asked for.
+    pub(super) fn repairs(&self) -> bool {
+        !self.again.is_empty()
+    }
+
+    /// The next fragment that was never sent, and its bytes.
+    pub(super) fn next_fragment(&mut self, now: Time) -> Option<(Fragment, &[u8])> {
+        let index = self.next;
+        if index >= self.left.len() {
+            return None;
+        }
+        self.next += 1;
+        self.fragment(index, now)
+    }
+
+    /// The next fragment that was asked for, and its bytes.
+    pub(super) fn next_repair(&mut self, now: Time) -> Option<(Fragment, &[u8])> {
+        let index = self.again.pop_front()?;
+        self.fragment(index, now)
+    }
+
+    /// Queues what is missing of a part, except what is on its way: never sent yet, or within the last `round_trip`.
+    pub(super) fn ask(&mut self, offset: u32, len: u32, round_trip: Duration, now: Time) {
+        let (Ok(offset), Ok(len)) = (usize::try_from(offset), usize::try_from(len)) else {
+            return;
+        };
+        let first = offset / self.step;
+        let end = offset
+            .saturating_add(len)
+            .div_ceil(self.step)
+            .min(self.next);
+        let round_trip = u32::try_from(round_trip.as_millis()).unwrap_or(u32::MAX);
+        let elapsed = self.elapsed(now);
+        for index in first..end {
+            let Some(left) = self.left.get_mut(index) else {
+                return;
+            };
+            if *left == u32::MAX || (*left != 0 && elapsed.saturating_sub(*left) < round_trip) {
+                continue;
+            }
+            // Marked as on its way, so that it is not queued twice.
+            *left = u32::MAX;
+            self.again.push_back(index);
+        }
+    }
+
+    /// Queues the last fragment: from it a receiver learns of all that it lacks.
+    pub(super) fn ask_last(&mut self) {
+        if self.again.is_empty() && !self.left.is_empty() {
+            self.again.push_back(self.left.len() - 1);
+        }
+    }
+
+    fn fragment(&mut self, index: usize, now: Time) -> Option<(Fragment, &[u8])> {
+        let elapsed = self.elapsed(now);
+        *self.left.get_mut(index)? = elapsed;
+        let bytes = self.payload.as_ref();
+        let start = index * self.step;
+        let end = (start + self.step).min(bytes.len());
+        let fragment = Fragment {
+            total: u32::try_from(bytes.len()).ok()?,
+            offset: u32::try_from(start).ok()?,
+        };
+        Some((fragment, bytes.get(start..end)?))
+    }
+
+    fn elapsed(&self, now: Time) -> u32 {
+        let elapsed = u32::try_from(now.since(self.begun).as_millis()).unwrap_or(u32::MAX);
+        elapsed.saturating_add(1).min(u32::MAX - 1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RTT: Duration = Duration::from_millis(10);
+
+    fn offsets(transfer: &mut Transfer<Vec<u8>>, now: Time) -> Vec<u32> {
+        std::iter::from_fn(|| transfer.next_repair(now).map(|(f, _)| f.offset)).collect()
+    }
+
+    #[test]
+    fn all_go_once_and_what_is_asked_for_again() {
+        let payload: Vec<u8> = (0..10).collect();
+        let mut transfer = Transfer::new(SampleMeta::default(), payload, 4, Time(0));
+        let (first, bytes) = transfer.next_fragment(Time(0)).unwrap();
+        assert_eq!(
+            (first.offset, first.total, bytes),
+            (0, 10, &[0, 1, 2, 3][..])
+        );
+        // What was never sent needs no repair.
+        transfer.ask(0, 10, RTT, Time(0) + RTT);
+        assert_eq!(offsets(&mut transfer, Time(0) + RTT), [0]);
+        transfer.next_fragment(Time(0) + RTT);
+        let (last, bytes) = transfer.next_fragment(Time(0) + RTT).unwrap();
+        assert_eq!((last.offset, bytes), (8, &[8, 9][..]));
+        assert!(!transfer.is_under_way());
+        // All of them left less than a round trip ago.
+        transfer.ask(0, 10, RTT, Time(0) + RTT + RTT / 2);
+        assert!(!transfer.repairs());
+        let later = Time(0) + 3 * RTT;
+        transfer.ask(5, 1, RTT, later);
+        transfer.ask(4, 6, RTT, later);
+        assert_eq!(offsets(&mut transfer, later), [4, 8]);
+        transfer.ask(0, u32::MAX, RTT, later);
+        transfer.ask(u32::MAX, u32::MAX, RTT, later);
+        assert_eq!(offsets(&mut transfer, later), [0]);
+    }
+}
