@@ -45,8 +45,13 @@ impl Schemas {
             return true;
         }
         if let Some(fetch) = self.fetches.get_mut(&hash) {
-            // Whoever announced it last is the likeliest to be there.
-            fetch.from = from;
+            // Whoever announced it last is the likeliest to be there, and that the one before did not answer says
+            // nothing about it.
+            if fetch.from != from {
+                fetch.from = from;
+                fetch.next = now;
+                fetch.tries = 0;
+            }
             return true;
         }
         if self.texts.len() >= TEXTS_MAX || self.fetches.len() >= FETCHES_MAX {
@@ -161,6 +166,25 @@ mod tests {
         let text = schemas.text(HASH).unwrap();
         assert!(text.ends_with("aaaend"));
         assert_eq!(schemas.poll_timeout(), None);
+    }
+
+    #[test]
+    fn whoever_announces_a_text_next_is_asked_at_once() {
+        let out = &mut Outbox::default();
+        let mut schemas = Schemas::default();
+        schemas.want(HASH, Tag(1), Time(0));
+        let mut now = Time(0);
+        for _ in 0..12 {
+            now = schemas.poll_timeout().unwrap();
+            schemas.handle_timeout(now, out);
+        }
+        schemas.want(HASH, Tag(1), now);
+        assert_eq!(schemas.poll_timeout(), Some(now + RETRY_MAX));
+
+        schemas.want(HASH, Tag(2), now);
+        assert_eq!(schemas.poll_timeout(), Some(now));
+        schemas.handle_timeout(now, out);
+        assert_eq!(schemas.poll_timeout(), Some(now + RETRY));
     }
 
     #[test]
