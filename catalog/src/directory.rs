@@ -38,7 +38,7 @@ const PULL_QUIET: Duration = Duration::from_millis(60);
 /// Pause after a request that may be lost. It grows after some tries only: most are answered or lost, not refused.
 const PULL_RETRY: Duration = Duration::from_millis(120);
 const PULL_STEADY: u32 = 6;
-const PULL_RETRY_MAX: Duration = Duration::from_secs(1);
+const PULL_RETRY_MAX: Duration = Duration::from_millis(400);
 /// Ranges beyond a gap that are remembered, and gaps that are asked for at one time.
 const RANGES_MAX: usize = 32;
 /// Items of all other hosts.

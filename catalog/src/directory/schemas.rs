@@ -18,7 +18,7 @@ const PARTS_MAX: usize = 64;
 /// Pause after a request that may be lost. It grows after some tries only.
 const RETRY: Duration = Duration::from_millis(150);
 const STEADY: u32 = 6;
-const RETRY_MAX: Duration = Duration::from_secs(2);
+const RETRY_MAX: Duration = Duration::from_millis(600);
 
 #[derive(Default)]
 pub(super) struct Schemas {
