@@ -16,13 +16,13 @@ use ddx_wire::message::{
     AckEntry, Change, Delta, DigestEntry, GrantEntry, Greeting, Introduction, ItemState, Message,
     Range, Reception, RenewEntry, SchemaPart, SubscribeEntry,
 };
-use ddx_wire::sample::{Fragment, Record};
+use ddx_wire::sample::{Fragment, Preamble, Record};
 use ddx_wire::seal::{
     self, DomainKey, HEADER_BYTES, Lane, MAX_DATAGRAM_BYTES, MIXED_STREAMS, Purpose, Sealer,
 };
 use ddx_wire::{
-    Contract, DomainId, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName, Pattern,
-    SchemaHash, Seq, StreamId, Tag, Time, WriterState, codec,
+    Contract, Delivery, DomainId, Epoch, HostId, HostName, Incarnation, ItemDescription, ItemName,
+    Pattern, SchemaHash, Seq, StreamId, Tag, Time, WriterState, codec,
 };
 
 use crate::Input;
@@ -32,6 +32,8 @@ const ACTS: usize = 400;
 /// Small, so that a play can fill it.
 const BUDGET_BYTES: usize = 200_000;
 const MAX_STREAMS: usize = 8;
+/// The longest datagram that is tried.
+const JUMBO_BYTES: usize = 8_972;
 /// More than any one act may cause: each datagram in is answered by few.
 const MAX_TRANSMITS: usize = 20_000;
 
@@ -64,7 +66,7 @@ struct World {
     now: Time,
     catalog: Catalog,
     receiver: Receiver,
-    sender: Sender,
+    sender: Sender<Vec<u8>>,
     members: Vec<Member>,
     /// What was said last: to be said again, in part or damaged.
     last: Vec<u8>,
@@ -438,8 +440,13 @@ impl World {
         match event {
             Event::Session { tag, opener, .. } => self.receiver.session(tag, opener),
             Event::SessionClosed { tag } => self.receiver.drop_session(tag),
-            Event::Expect { tag, stream, .. } => {
-                self.receiver.listen(tag, stream, self.now);
+            Event::Expect {
+                tag,
+                stream,
+                contract,
+                ..
+            } => {
+                self.receiver.listen(tag, stream, &contract, self.now);
                 if self.receiver.books(tag, stream).is_some() {
                     self.expected.entry((tag, stream)).or_default();
                 }
@@ -466,6 +473,10 @@ impl World {
             } => {
                 self.sender.held(stream, tag, epoch, seq, self.now);
             }
+            Event::Report { tag, report } => {
+                self.sender.handle_report(tag, &report, self.now);
+            }
+            Event::Nack { tag, nack } => self.sender.handle_nack(tag, &nack, self.now),
             Event::Clock { offset, .. } => {
                 let _anywhere = offset.to_local(Time(u64::MAX));
             }
@@ -500,12 +511,15 @@ impl World {
                     epoch,
                     seq,
                 }) => {
-                    self.catalog
-                        .holds(tag, stream, epoch, seq, false, self.now);
+                    self.catalog.holds(tag, stream, epoch, seq, false, self.now);
                 }
                 Some(ReceiverEvent::OnGroup { tag, stream }) => {
                     self.catalog.heard_on_group(tag, stream, self.now);
                 }
+                Some(ReceiverEvent::Report(tag, report)) => {
+                    self.catalog.report(tag, report, self.now);
+                }
+                Some(ReceiverEvent::Nack(tag, nack)) => self.catalog.nack(tag, nack, self.now),
                 None => break,
             }
         }
@@ -515,11 +529,13 @@ impl World {
     fn settle_sending(&mut self) {
         for count in 0.. {
             assert!(count < MAX_TRANSMITS, "one act repeats without end");
-            let Some(SenderEvent::Repeat { stream, to }) = self.sender.poll_event() else {
+            let Some(SenderEvent::Fetch(fetch)) = self.sender.poll_event() else {
                 break;
             };
-            let meta = self.next(stream);
-            self.sender.repeat(stream, to, &meta, b"present", self.now);
+            let meta = self.next(fetch.stream);
+            let payload = b"present".to_vec();
+            self.sender
+                .fetched(&fetch, Some((&meta, &payload)), self.now);
         }
         let mut batch = Vec::new();
         for count in 0.. {
@@ -529,7 +545,7 @@ impl World {
                 break;
             };
             let longest = transmit.segment.map_or(batch.len(), usize::from);
-            assert!(longest <= MAX_DATAGRAM_BYTES, "{longest} bytes leave");
+            assert!(longest <= JUMBO_BYTES, "{longest} bytes leave");
         }
     }
 
@@ -651,7 +667,11 @@ fn message(input: &mut Input<'_>) -> Message {
                 contract: Contract {
                     max_rate_mhz: input.flag().then(|| input.word()),
                     max_age_ms: input.flag().then(|| input.word()),
-                    delivery: input.pick(&[Delivery::Latest, Delivery::Every, Delivery::EveryFromRing]),
+                    delivery: input.pick(&[
+                        Delivery::Latest,
+                        Delivery::Every,
+                        Delivery::EveryFromRing,
+                    ]),
                     ..Contract::default()
                 },
                 epoch: Epoch(input.number()),
@@ -734,9 +754,15 @@ fn hash(input: &mut Input<'_>) -> SchemaHash {
     SchemaHash([input.byte() % 4; 16])
 }
 
-/// The records of one data datagram: good ones, and what follows them.
+/// The preamble and the records of one data datagram: good ones, and what follows them.
 fn records(input: &mut Input<'_>) -> Vec<u8> {
-    let mut plaintext = Vec::new();
+    let preamble = Preamble {
+        path: input.short() % 40,
+        number: input.word(),
+        sent_us: input.word(),
+        is_probe: false,
+    };
+    let mut plaintext = preamble.to_bytes().to_vec();
     for _ in 0..=input.byte() % 4 {
         let stream = StreamId(input.word());
         let repeat = input.flag();
@@ -751,11 +777,13 @@ fn records(input: &mut Input<'_>) -> Vec<u8> {
             total: u32::from(input.short()),
             offset: u32::from(input.short()),
         });
+        let gone = input.flag();
         let payload = input.chunk();
         // Fails for what no record may say; bytes that are no record come by act 7.
         let _unsaid = Record {
             stream,
             repeat,
+            gone,
             meta,
             fragment,
             payload,

@@ -18,7 +18,9 @@ use ddx_store::control::{
 use ddx_store::notify::Bells;
 use ddx_store::segment::{Origin, SegmentFds, SegmentWriter, Spec};
 use ddx_store::server::registry::{ClientId, Effect, Event, Identity, Registry, RemoteItem};
-use ddx_wire::{Contract, Epoch, HostName, ItemDescription, ItemName, SchemaHash, Seq, Time, WriterState};
+use ddx_wire::{
+    Contract, Epoch, HostName, ItemDescription, ItemName, SchemaHash, Seq, Time, WriterState,
+};
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};
 
@@ -296,6 +298,8 @@ impl World {
                     self.liars.retain(|liar| *liar != client);
                 }
                 Effect::Event(event) => self.hear(event),
+                // What a service manager would keep: there is none.
+                Effect::Keep(_) => {}
             }
         }
     }
