@@ -19,17 +19,16 @@ use ddx_wire::{
 mod host;
 mod net;
 mod networks;
-mod random;
 mod rx;
 mod store;
 mod tx;
 
+pub use crate::random::Random;
 pub use host::Host;
 use host::HostClock;
 pub use net::Link;
 use net::{CONTROL_PORT, DATA_PORT, Net, Way};
 use networks::Networks;
-pub use random::Random;
 pub use tx::Counts;
 
 /// A lease lasts three seconds and is looked at four times a second; the rest is for queues and slow clocks.

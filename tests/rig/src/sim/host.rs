@@ -16,10 +16,10 @@ use ddx_wire::{
     StreamId, Tag, Time, WriterState,
 };
 
-use super::random::Random;
 use super::rx::{Mirror, MirrorId, Rx};
 use super::store::Store;
 use super::tx::{Counts, Tx};
+use crate::random::Random;
 
 /// One simulated host.
 pub struct Host {

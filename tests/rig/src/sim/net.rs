@@ -4,7 +4,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 use super::nanos;
-use super::random::Random;
+use crate::random::Random;
 
 /// Port of every host's control socket.
 pub(super) const CONTROL_PORT: u16 = 7000;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use ddx_wire::sample::SampleMeta;
 use ddx_wire::{Epoch, ItemName, Seq, Time};
 
-use super::random::Random;
+use crate::random::Random;
 
 /// Samples that an item keeps, as the real one does by default.
 const DEPTH: usize = 8;
