@@ -122,6 +122,15 @@ pub struct Counters {
     pub too_large: u64,
 }
 
+/// What became of frames in both directions of a host's link.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Books {
+    /// From the host.
+    pub up: Counters,
+    /// To the host.
+    pub down: Counters,
+}
+
 /// The arithmetic of one direction: when what is pushed now will arrive.
 ///
 /// For callers with a calendar of their own; [`Link`] is one with a calendar.

@@ -11,12 +11,13 @@ use std::io::{self, Read};
 use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::process::Command;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ddx_rig::lab::Lab;
+use ddx_rig::link::Profile;
 
 const USAGE: &str = "usage: lab_probe echo PORT | ping ADDRESS COUNT | send ADDRESS COUNT | join GROUP PORT \
-                     | hold HOST...";
+                     | train ADDRESS COUNT INTERVAL_US BYTES | trace PORT [GROUP] | wire | hold HOST...";
 
 fn main() -> Result<(), Box<dyn Error>> {
     let words: Vec<String> = std::env::args().skip(1).collect();
@@ -30,6 +31,15 @@ fn main() -> Result<(), Box<dyn Error>> {
         ["ping", to, count] => ping(to.parse()?, count.parse()?),
         ["send", to, count] => send(to.parse()?, count.parse()?),
         ["join", group, port] => join(group.parse()?, port.parse()?),
+        ["train", to, count, interval, bytes] => train(
+            to.parse()?,
+            count.parse()?,
+            Duration::from_micros(interval.parse()?),
+            bytes.parse()?,
+        ),
+        ["trace", port] => trace(port.parse()?, None),
+        ["trace", port, group] => trace(port.parse()?, Some(group.parse()?)),
+        ["wire"] => wire(),
         ["hold", hosts @ ..] => hold(hosts),
         _ => Err(USAGE.into()),
     }
@@ -90,6 +100,91 @@ fn join(group: Ipv4Addr, port: u16) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
+/// Sends numbered and stamped datagrams of so many bytes of payload, one each interval; late, it catches up.
+fn train(
+    to: SocketAddrV4,
+    count: u32,
+    interval: Duration,
+    bytes: usize,
+) -> Result<(), Box<dyn Error>> {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
+    let mut payload = vec![0; bytes.max(STAMP_BYTES)];
+    let start = Instant::now();
+    for number in 0..count {
+        let due = interval * number;
+        thread::sleep(due.saturating_sub(start.elapsed()));
+        payload[..4].copy_from_slice(&number.to_le_bytes());
+        payload[4..STAMP_BYTES].copy_from_slice(&clock_ns()?.to_le_bytes());
+        socket.send_to(&payload, to)?;
+    }
+    println!("sent {count} in {} us", start.elapsed().as_micros());
+    Ok(())
+}
+
+/// Receives what [`train`] sends until its input ends, then tells of each datagram its number, how many
+/// nanoseconds it was on the way, and when it came.
+fn trace(port: u16, group: Option<Ipv4Addr>) -> Result<(), Box<dyn Error>> {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port))?;
+    rustix::net::sockopt::set_socket_recv_buffer_size(&socket, 4 << 20)?;
+    if let Some(group) = group {
+        socket.join_multicast_v4(&group, &Ipv4Addr::UNSPECIFIED)?;
+    }
+    // The end of the input is looked for only when nothing comes, so that all that is there is told.
+    socket.set_read_timeout(Some(Duration::from_millis(20)))?;
+    println!("ready");
+    let input = thread::spawn(|| io::stdin().read_to_end(&mut Vec::new()));
+    let mut seen = Vec::new();
+    let mut payload = [0; 1500];
+    loop {
+        match socket.recv(&mut payload) {
+            Ok(length) => {
+                let now = clock_ns()?;
+                let stamp = stamp(&payload[..length]);
+                seen.extend(stamp.map(|(number, sent)| (number, now - sent, now)));
+            }
+            Err(_) if input.is_finished() => break,
+            Err(_) => {}
+        }
+    }
+    for (number, delay, at) in seen {
+        println!("{number} {delay} {at}");
+    }
+    println!("end");
+    Ok(())
+}
+
+fn stamp(payload: &[u8]) -> Option<(u32, u64)> {
+    let (number, rest) = payload.split_first_chunk()?;
+    let sent = rest.first_chunk()?;
+    Some((u32::from_le_bytes(*number), u64::from_le_bytes(*sent)))
+}
+
+/// The one clock of all hosts of a lab.
+fn clock_ns() -> Result<u64, Box<dyn Error>> {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    let now = Duration::try_from(now)?;
+    Ok(u64::try_from(now.as_nanos())?)
+}
+
+/// Builds a lab, makes one link slow, and tells how long a datagram and its answer take over it.
+fn wire() -> Result<(), Box<dyn Error>> {
+    let lab = Lab::new(&["a", "b"])?;
+    let probe = std::env::current_exe()?;
+    let echo = lab
+        .host("b")
+        .spawn(Command::new(&probe).args(["echo", "7000"]))?;
+    echo.wait_line(|line| line == "ready", Duration::from_secs(10))?;
+    lab.host("b")
+        .set_link(&Profile::parse("lan --delay 20ms")?)?;
+    let start = Instant::now();
+    let mut ping = Command::new(&probe);
+    ping.args(["ping", "10.77.0.2:7000", "20"]);
+    let said = lab.host("a").exec(&ping)?.stdout;
+    println!("rights {:?}", lab.rights());
+    println!("{} in {} ms", said.trim(), start.elapsed().as_millis());
+    Ok(())
+}
+
 /// Builds a lab with a program in each host, tells whose namespaces it is, and keeps it until its input ends.
 fn hold(hosts: &[&str]) -> Result<(), Box<dyn Error>> {
     let lab = Lab::new(hosts)?;
@@ -114,3 +209,6 @@ fn hold(hosts: &[&str]) -> Result<(), Box<dyn Error>> {
     io::stdin().read_to_end(&mut Vec::new())?;
     Ok(())
 }
+
+/// Number and time of sending.
+const STAMP_BYTES: usize = 12;

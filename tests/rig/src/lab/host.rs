@@ -10,6 +10,7 @@ use super::process::{Output, Process};
 use super::shell::{Rights, search_path};
 use super::switch::Loss;
 use super::{Lab, address_of};
+use crate::link::{Books, Profile};
 
 /// A host of a [`Lab`].
 #[derive(Clone, Copy, Debug)]
@@ -128,6 +129,39 @@ impl<'lab> Host<'lab> {
     /// See [`Host::cut`].
     pub fn set_loss(&self, loss: Loss) -> Result<(), Error> {
         self.lab.set_fault(self.index, |fault| fault.loss = loss)
+    }
+
+    /// Emulates the link by this profile from now on, also in the midst of traffic.
+    ///
+    /// The first call puts a wire into the link, which takes some tens of milliseconds and may lose a frame then;
+    /// memberships of groups stay. Each call begins the profile's sequence of chances anew, so that the same
+    /// frames after it are lost in each run. What is on its way keeps its time. Cuts and [`Host::set_loss`] work
+    /// at the switch's end, on what the wire has let through and on what it is to carry.
+    ///
+    /// # Errors
+    /// [`Error::Io`] and [`Error::Step`] if the machine or the lab refuses the wire.
+    pub fn set_link(&self, profile: &Profile) -> Result<(), Error> {
+        self.lab.set_link(self.index, Some(profile))
+    }
+
+    /// Lets the link pass all that comes, at once. A wire that is there stays.
+    ///
+    /// # Errors
+    /// See [`Host::set_link`].
+    pub fn clear_link(&self) -> Result<(), Error> {
+        self.lab.set_link(self.index, None)
+    }
+
+    /// Returns what became of frames on an emulated link since it was first set.
+    #[must_use]
+    pub fn books(&self) -> Books {
+        self.lab.books(self.index).0
+    }
+
+    /// Returns how many frames were lost because the wire did not keep up, which no profile asks for.
+    #[must_use]
+    pub fn overruns(&self) -> u64 {
+        self.lab.books(self.index).1
     }
 
     /// Returns the command that runs `command` in this host's namespaces.

@@ -16,6 +16,12 @@ pub struct Count {
 }
 
 impl Count {
+    /// Counts one packet.
+    pub(crate) fn add(&mut self, bytes: usize) {
+        self.packets += 1;
+        self.bytes += u64::try_from(bytes).unwrap_or(u64::MAX);
+    }
+
     fn since(self, earlier: Self) -> Self {
         Self {
             packets: self.packets.saturating_sub(earlier.packets),
@@ -31,6 +37,15 @@ pub struct Traffic {
     pub from: Count,
     /// What the switch handed to the host, counted after faults.
     pub to: Count,
+}
+
+impl Traffic {
+    fn add(&mut self, other: Self) {
+        self.from.packets += other.from.packets;
+        self.from.bytes += other.from.bytes;
+        self.to.packets += other.to.packets;
+        self.to.bytes += other.to.bytes;
+    }
 }
 
 /// All counters of a lab at one moment.
@@ -62,13 +77,16 @@ impl Counters {
         let mut total = Traffic::default();
         for ((_, of), traffic) in &self.traffic {
             if of == label {
-                total.from.packets += traffic.from.packets;
-                total.from.bytes += traffic.from.bytes;
-                total.to.packets += traffic.to.packets;
-                total.to.bytes += traffic.to.bytes;
+                total.add(*traffic);
             }
         }
         total
+    }
+
+    /// Adds what was counted elsewhere.
+    pub(crate) fn add(&mut self, host: &str, label: &str, traffic: Traffic) {
+        let key = (host.to_owned(), label.to_owned());
+        self.traffic.entry(key).or_default().add(traffic);
     }
 
     /// Returns what was counted after `earlier` was taken.
@@ -167,6 +185,8 @@ pub(crate) fn bridge_batch() -> String {
 }
 
 /// Returns the `nft` text of the table that counts and drops, for ports `p1` to `pN`.
+///
+/// A port with a wire is `w1` to `wN`: the switch drops there, and counts no longer, which the wire does instead.
 pub(crate) fn base_rules(ports: usize) -> String {
     let mut rules = format!(
         "add table {TABLE}\n\
@@ -185,7 +205,7 @@ pub(crate) fn base_rules(ports: usize) -> String {
             line(
                 &mut rules,
                 format_args!(
-                    "add rule {TABLE} faults_{direction} {key} p{port} jump fault_{direction}_p{port}"
+                    "add rule {TABLE} faults_{direction} {key} {{ p{port}, w{port} }} jump fault_{direction}_p{port}"
                 ),
             );
         }
