@@ -19,10 +19,13 @@ use crate::outbox::{Dest, Outbox, Outgoing, Target};
 use crate::paths::Paths;
 use crate::rng::Rng;
 
-/// Beacons come fast at first, so that a domain meets within a round trip, then slowly, for those who were deaf. At a loss
-/// of one in three, one start in a thousand is heard by none of the first six.
-const BEACON_START: [Duration; 5] = [
-    Duration::from_millis(100),
+/// Beacons come fast at first, so that a domain meets within a round trip, then slowly, for those who were deaf. When two
+/// hosts start together, the first beacon of each is lost in a switch that snoops: it learns of a new member some 10 ms
+/// late. At a loss of one in three, one start in thousands is heard by none of the first eight.
+const BEACON_START: [Duration; 7] = [
+    Duration::from_millis(15),
+    Duration::from_millis(30),
+    Duration::from_millis(60),
     Duration::from_millis(200),
     Duration::from_millis(700),
     Duration::from_secs(1),
