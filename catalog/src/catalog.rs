@@ -561,6 +561,8 @@ impl Catalog {
         }
         let version = self.directory.version();
         self.out.send(tag, &Message::Ping { version });
+        let summary = self.directory.summary(self.sessions.tag(), &mut self.rng);
+        self.out.send(tag, &summary);
         let waiting = std::mem::take(&mut self.waiting);
         for (to, bytes) in waiting {
             if to == tag {

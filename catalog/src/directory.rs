@@ -463,7 +463,7 @@ impl Directory {
         if self.next_digest.is_some_and(|at| at <= now) {
             self.next_digest = Some(now + DIGEST_PERIOD);
             if let Some(to) = rng.pick(up) {
-                let entries = self.digest(news, rng);
+                let entries = self.digest(news, DIGEST_SLICE, rng);
                 out.send(to, &Message::Digest(entries));
             }
         }
@@ -476,17 +476,24 @@ impl Directory {
         self.schemas.handle_timeout(now, out);
     }
 
-    fn digest(&self, news: DigestEntry, rng: &mut Rng) -> Vec<DigestEntry> {
+    /// What is known of all hosts, as far as one datagram holds it: for a host that comes back, which may have missed
+    /// anything, and may know what this one has missed of hosts that were cut off with it.
+    pub(crate) fn summary(&self, me: Tag, rng: &mut Rng) -> Message {
+        let news = DigestEntry {
+            tag: me,
+            version: self.own.version(),
+        };
+        Message::Digest(self.digest(news, DIGEST_ENTRIES, rng))
+    }
+
+    fn digest(&self, news: DigestEntry, most: usize, rng: &mut Rng) -> Vec<DigestEntry> {
         let start = rng.below(self.remotes.len());
         let known = self.remotes.values().map(|r| DigestEntry {
             tag: r.tag,
             version: r.have,
         });
         let known = known.clone().skip(start).chain(known.take(start));
-        std::iter::once(news)
-            .chain(known)
-            .take(DIGEST_SLICE)
-            .collect()
+        std::iter::once(news).chain(known).take(most).collect()
     }
 
     fn schedule_push(&mut self, now: Time) {
@@ -671,138 +678,4 @@ fn hide(
 }
 
 #[cfg(test)]
-mod tests {
-    use ddx_wire::message::Change;
-    use ddx_wire::{Epoch, WriterState};
-
-    use super::*;
-
-    const OWNER: HostId = HostId([4; 16]);
-    const LIFE: Tag = Tag(4);
-
-    fn description(rest: &str) -> ItemDescription {
-        ItemDescription {
-            name: ItemName::parse(rest, &HostName::parse("r").unwrap()).unwrap(),
-            schema_hash: SchemaHash([1; 16]),
-            capacity_bytes: 8,
-            epoch: Epoch(1),
-            writer: WriterState::Live,
-            program: "p".to_owned(),
-        }
-    }
-
-    fn following(out: &mut Outbox) -> Directory {
-        let mut directory = Directory::new();
-        let name = HostName::parse("r").unwrap();
-        directory.follow(OWNER, LIFE, &name, 0, Time(0), out);
-        directory
-    }
-
-    fn delta(from: u64, changes: &[(u64, &str)], version: u64) -> Delta {
-        let to = changes.last().map_or(from, |(version, _)| *version);
-        let change = |(version, name): &(u64, &str)| Change {
-            version: *version,
-            item: ItemState::Announced(description(name)),
-        };
-        Delta {
-            range: Range { from, to },
-            version,
-            changes: changes.iter().map(change).collect(),
-        }
-    }
-
-    fn have(directory: &Directory) -> u64 {
-        directory.remotes[&OWNER].have
-    }
-
-    #[test]
-    fn deltas_in_any_order_meet_and_a_gap_is_asked_for() {
-        let out = &mut Outbox::default();
-        let mut directory = following(out);
-        assert!(directory.handle_delta(OWNER, LIFE, delta(4, &[(6, "c")], 6), Time(1), out));
-        assert_eq!(have(&directory), 0);
-        let due = directory.poll_timeout();
-        assert!(due.is_some_and(|at| at <= Time(1) + PULL_QUIET), "{due:?}");
-        let first = delta(0, &[(1, "a"), (4, "b")], 6);
-        assert!(directory.handle_delta(OWNER, LIFE, first.clone(), Time(2), out));
-        assert_eq!(have(&directory), 6);
-        assert!(
-            directory.handle_delta(OWNER, LIFE, first, Time(3), out),
-            "idempotent"
-        );
-        assert_eq!(have(&directory), 6);
-    }
-
-    #[test]
-    fn an_item_is_shown_once_its_schema_is_there() {
-        let out = &mut Outbox::default();
-        let mut directory = following(out);
-        directory.handle_delta(OWNER, LIFE, delta(0, &[(1, "a")], 1), Time(1), out);
-        assert!(out.pop_event().is_none());
-        let part = SchemaPart {
-            hash: SchemaHash([1; 16]),
-            index: 0,
-            count: 1,
-            bytes: b"u64".to_vec(),
-        };
-        directory.handle_schema_part(part, Time(2), out);
-        let known = out.pop_event();
-        assert!(
-            matches!(known, Some(Event::ItemKnown { schema_text, .. }) if &*schema_text == "u64")
-        );
-    }
-
-    #[test]
-    fn changes_outside_their_range_or_prefix_are_refused() {
-        let out = &mut Outbox::default();
-        let mut directory = following(out);
-        let mut lie = delta(0, &[(1, "a")], 1);
-        lie.range.to = 0;
-        assert!(!directory.handle_delta(OWNER, LIFE, lie, Time(1), out));
-        let foreign = delta(0, &[(1, "other/a")], 1);
-        assert!(!directory.handle_delta(OWNER, LIFE, foreign, Time(1), out));
-        assert!(!directory.handle_delta(OWNER, Tag(9), delta(0, &[], 0), Time(1), out));
-    }
-
-    #[test]
-    fn what_cannot_travel_is_refused_by_name() {
-        let mut directory = Directory::new();
-        let long = "x".repeat(70_000);
-        let error = directory
-            .announce(description("a"), &long, Time(0))
-            .unwrap_err();
-        assert!(
-            error
-                .to_string()
-                .contains("schema of `r/a` takes 70000 bytes")
-        );
-        let mut wordy = description("a");
-        wordy.program = "p".repeat(600);
-        let error = directory.announce(wordy, "u64", Time(0)).unwrap_err();
-        assert!(matches!(error, Error::DescriptionTooLong { .. }));
-    }
-
-    #[test]
-    fn a_full_directory_refuses_own_items_by_name_and_counts_those_of_others() {
-        let out = &mut Outbox::default();
-        let mut directory = following(out);
-        let names: Vec<String> = (0..=ITEMS_MAX).map(|number| number.to_string()).collect();
-        for name in &names[..ITEMS_MAX] {
-            directory
-                .announce(description(name), "u64", Time(0))
-                .unwrap();
-        }
-
-        let refused = directory.announce(description("more"), "u64", Time(0));
-        let changes: Vec<(u64, &str)> = (1..).zip(names.iter().map(String::as_str)).collect();
-        let all = delta(0, &changes, u64::try_from(changes.len()).unwrap());
-        assert!(directory.handle_delta(OWNER, LIFE, all, Time(1), out));
-
-        assert_eq!(
-            refused.unwrap_err().to_string(),
-            "directory is full: 65536 items; `r/more` was not announced"
-        );
-        assert_eq!(directory.remotes[&OWNER].items.len(), ITEMS_MAX);
-        assert_eq!(directory.dropped, 1);
-    }
-}
+mod tests;
