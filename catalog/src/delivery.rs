@@ -30,6 +30,7 @@ mod early;
 mod flow;
 mod order;
 mod pace;
+mod parity;
 mod path;
 mod queue;
 mod reassembly;

@@ -17,6 +17,8 @@ pub(super) struct Congestion {
     loss: f64,
     /// Newest share of datagrams lost.
     loss_now: f64,
+    /// Share of some hundred datagrams lost.
+    loss_mean: f64,
     /// Newest growth of the time on the way.
     queue: Duration,
     /// Reports in a row without a sign of a full path.
@@ -64,6 +66,7 @@ impl Congestion {
             bytes_per_second: RATE_FIRST,
             loss: 0.0,
             loss_now: 0.0,
+            loss_mean: 0.0,
             queue: Duration::ZERO,
             calm: 0,
             was_full: false,
@@ -90,13 +93,12 @@ impl Congestion {
 
     /// Newest share of datagrams lost, thousandths.
     pub(super) fn loss_permille(&self) -> u16 {
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a share is between 0 and 1"
-        )]
-        let permille = (self.loss_now * 1000.0) as u16;
-        permille
+        permille(self.loss_now)
+    }
+
+    /// Share of some hundred datagrams that were lost, thousandths.
+    pub(super) fn mean_loss_permille(&self) -> u16 {
+        permille(self.loss_mean)
     }
 
     /// Takes in a report. `limited` tells whether the rate held the sender back since the one before.
@@ -116,6 +118,7 @@ impl Congestion {
         let all = f64::from(progress.received) + f64::from(progress.missing);
         if all > 0.0 {
             self.loss_now = f64::from(progress.missing) / all;
+            self.loss_mean += (self.loss_now - self.loss_mean) * all / (all + MEAN_DATAGRAMS);
         }
         let arrived = f64::from(progress.bytes) / progress.span.as_secs_f64().max(0.001);
         let capacity = arrived / (1.0 - self.loss.min(0.7));
@@ -236,6 +239,18 @@ impl Least {
     }
 }
 
+fn permille(share: f64) -> u16 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a share is between 0 and 1"
+    )]
+    let permille = (share * 1000.0) as u16;
+    permille
+}
+
+/// Datagrams over which loss is averaged: a burst of four is 4 % of them.
+const MEAN_DATAGRAMS: f64 = 100.0;
 /// A guess for a path that was never used: what a LAN carries many times, and a radio link tells at once.
 const RATE_FIRST: f64 = 12_500_000.0;
 /// One datagram each 120 ms, so that there is something to hear of.

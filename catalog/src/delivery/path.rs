@@ -15,6 +15,7 @@ use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 use super::congestion::{Congestion, Reporter};
 use super::flow::{Flow, Progress};
 use super::pace::{Pace, batch_bytes};
+use super::parity;
 use super::queue::{DATAGRAM_OVERHEAD, Limit, Queue};
 use super::sender::FIRST_UNICAST;
 use super::transfer::Transfer;
@@ -556,10 +557,17 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         flow.turn = flow.turn.max(self.turn);
         let offered = if large {
             let step = self.datagram_bytes - DATAGRAM_OVERHEAD - FRAGMENT_RECORD_BYTES;
+            let parities = parity::Link {
+                loss_permille: self.congestion.mean_loss_permille(),
+                rate: self.congestion.rate(),
+                round_trip: self.round_trip,
+            }
+            .parities(bytes.len().div_ceil(step.max(1)), step);
             let transfer = Transfer::new(meta, payload.clone(), step, now);
             flow.begin(match again {
+                None => transfer.protect(parities),
+                Some([]) => transfer.protect(parities).again(&[], now),
                 Some(parts) => transfer.again(parts, now),
-                None => transfer,
             });
             Offered::Begins
         } else {

@@ -9,7 +9,7 @@ use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::Failure;
 use super::deadlines::Deadlines;
-use super::key;
+use super::{key, parity};
 
 /// Samples of which some fragments have arrived: a few of each stream.
 #[derive(Debug)]
@@ -68,6 +68,9 @@ struct Partial {
     last: Time,
     /// Longest fragment: all but the last have its length.
     step: usize,
+    /// The parities that came, by their numbers, of those that there are.
+    parities: BTreeMap<u8, Vec<u8>>,
+    parities_of: u8,
     round_trip: Duration,
     patience: Duration,
     /// Requests since the last fragment.
@@ -119,6 +122,8 @@ impl Reassembly {
                 ranges: Vec::new(),
                 last: now,
                 step: 0,
+                parities: BTreeMap::new(),
+                parities_of: fragment.parities,
                 round_trip: rules.round_trip,
                 patience: rules.patience,
                 asked: 0,
@@ -129,8 +134,11 @@ impl Reassembly {
             return Step::default();
         };
         (partial.last, partial.asked) = (now, 0);
-        partial.step = partial.step.max(record.payload.len());
-        match partial.add(fragment, record.payload) {
+        let room = self.budget_bytes.saturating_sub(self.held_bytes);
+        let before = partial.held_bytes();
+        let added = partial.add(fragment, record.payload, room);
+        self.held_bytes += partial.held_bytes() - before;
+        match added {
             Added::Whole => Step {
                 whole: self
                     .remove(place)
@@ -142,15 +150,13 @@ impl Reassembly {
                 Step::failed(record.meta, Failure::Undecodable)
             }
             Added::Part => {
-                let wait = if partial.has_gap() {
-                    REORDERING + partial.patience
+                // A gap is asked for soon, the end of the sample once nothing comes any more. Where parities are to come
+                // they may close the gap.
+                if partial.has_gap() && partial.parities_of == 0 {
+                    let wait = REORDERING + partial.patience;
+                    self.deadlines.set_earlier(place, now + wait);
                 } else {
-                    partial.tail_wait()
-                };
-                // A gap is asked for soon, the end of the sample once nothing comes any more.
-                match partial.has_gap() {
-                    true => self.deadlines.set_earlier(place, now + wait),
-                    false => self.deadlines.set(place, now + wait),
+                    self.deadlines.set(place, now + partial.tail_wait());
                 }
                 Step {
                     whole: None,
@@ -185,6 +191,12 @@ impl Reassembly {
     /// Whether some fragments of a sample have arrived.
     pub(super) fn has(&self, place: &Place) -> bool {
         self.partials.contains_key(place)
+    }
+
+    /// Bytes of incomplete samples.
+    #[cfg(test)]
+    pub(super) fn held_bytes(&self) -> usize {
+        self.held_bytes
     }
 
     pub(super) fn deadline(&self) -> Option<Time> {
@@ -228,7 +240,7 @@ impl Reassembly {
     fn remove(&mut self, place: Place) -> Option<Partial> {
         self.deadlines.clear(place);
         let partial = self.partials.remove(&place)?;
-        self.held_bytes -= partial.bytes.len();
+        self.held_bytes -= partial.held_bytes();
         Some(partial)
     }
 }
@@ -260,6 +272,10 @@ enum Added {
 }
 
 impl Partial {
+    fn held_bytes(&self) -> usize {
+        self.bytes.len() + self.parities.len() * self.step
+    }
+
     fn has_gap(&self) -> bool {
         self.ranges.len() > 1 || self.ranges.first().is_some_and(|(start, _)| *start > 0)
     }
@@ -269,18 +285,28 @@ impl Partial {
         TAIL.max(self.round_trip / 2) + self.patience
     }
 
-    /// The parts that lie between those that came, and the rest when `with_tail`.
+    /// The parts that lie between those that came, and the rest when `with_tail`. Where there are parities only as many as
+    /// these do not make up for.
     fn missing(&self, with_tail: bool) -> Vec<(u32, u32)> {
         let mut parts = Vec::new();
         let mut from = 0;
+        let mut enough = match self.parities.is_empty() {
+            true => usize::MAX,
+            false => self
+                .lacking()
+                .unwrap_or(usize::MAX)
+                .saturating_mul(self.step),
+        };
         let end = with_tail.then_some((self.bytes.len(), self.bytes.len()));
         for (start, until) in self.ranges.iter().copied().chain(end) {
-            if start > from
-                && let (Ok(offset), Ok(len)) = (u32::try_from(from), u32::try_from(start - from))
+            let len = (start - from).min(enough);
+            if len > 0
+                && let (Ok(offset), Ok(len)) = (u32::try_from(from), u32::try_from(len))
             {
                 parts.push((offset, len));
             }
-            if parts.len() == PARTS_MAX {
+            enough -= len;
+            if parts.len() == PARTS_MAX || enough == 0 {
                 break;
             }
             from = until;
@@ -288,9 +314,72 @@ impl Partial {
         parts
     }
 
+    /// Whether all bytes of a fragment came, in a sample of `total`.
+    fn has(&self, index: usize, total: usize) -> bool {
+        let start = index * self.step;
+        let end = (start + self.step).min(total);
+        let range = self.ranges.partition_point(|(_, e)| *e <= start);
+        let range = self.ranges.get(range);
+        range.is_some_and(|(s, e)| *s <= start && end <= *e)
+    }
+
+    /// How many more fragments or parities it takes; `None` if the sample can have no parities.
+    fn lacking(&self) -> Option<usize> {
+        let total = self.bytes.len();
+        parity::lacking(
+            total.div_ceil(self.step.max(1)),
+            self.parities_of,
+            |index| self.has(index, total),
+            |index| self.parity(index).is_some(),
+        )
+    }
+
+    fn parity(&self, index: usize) -> Option<&[u8]> {
+        let index = u8::try_from(index).ok()?;
+        self.parities.get(&index).map(Vec::as_slice)
+    }
+
+    /// Keeps a parity, if there is room for it.
+    fn add_parity(&mut self, parity: u8, of: u8, payload: &[u8], room: usize) -> Added {
+        let is_other = of != self.parities_of && !self.parities.is_empty();
+        if is_other || (self.step != 0 && self.step != payload.len()) {
+            // The sample was sent once more, in another way: these do not go together.
+            return Added::Part;
+        }
+        (self.step, self.parities_of) = (payload.len(), of);
+        if self.lacking().is_none() {
+            return Added::Contradiction;
+        }
+        if room >= payload.len() && !self.parities.contains_key(&parity) {
+            self.parities.insert(parity, payload.to_vec());
+        }
+        self.restore()
+    }
+
+    /// Restores the sample once enough is here.
+    fn restore(&mut self) -> Added {
+        if self.parities.is_empty() || self.lacking() != Some(0) {
+            return Added::Part;
+        }
+        let mut bytes = std::mem::take(&mut self.bytes);
+        let total = bytes.len();
+        let is_restored = parity::restore(
+            &mut bytes,
+            self.step,
+            |index| self.has(index, total),
+            |index| self.parity(index),
+            self.parities_of,
+        );
+        self.bytes = bytes;
+        match is_restored {
+            true => Added::Whole,
+            false => Added::Contradiction,
+        }
+    }
+
     /// Copies a fragment to its place. Fragments repeat or abut; those that overlap in part, or disagree on the length
     /// of the sample, are contradictions.
-    fn add(&mut self, fragment: Fragment, payload: &[u8]) -> Added {
+    fn add(&mut self, fragment: Fragment, payload: &[u8], room: usize) -> Added {
         let (Ok(total), Ok(start)) = (
             usize::try_from(fragment.total),
             usize::try_from(fragment.offset),
@@ -300,6 +389,13 @@ impl Partial {
         if total != self.bytes.len() {
             return Added::Contradiction;
         }
+        if let Some(parity) = fragment.parity(payload.len()) {
+            return self.add_parity(parity, fragment.parities, payload, room);
+        }
+        if !self.parities.is_empty() && payload.len() > self.step {
+            return Added::Contradiction;
+        }
+        self.step = self.step.max(payload.len());
         let end = start + payload.len();
         let next = self.ranges.partition_point(|(_, e)| *e <= start);
         match self.ranges.get(next) {
@@ -323,7 +419,7 @@ impl Partial {
         if self.ranges.as_slice() == [(0, total)] {
             return Added::Whole;
         }
-        Added::Part
+        self.restore()
     }
 
     /// Joins range `at` with the one after it if they touch.
@@ -367,7 +463,11 @@ mod tests {
     }
 
     fn insert(r: &mut Reassembly, seq: u64, total: u32, offset: u32, payload: &[u8]) -> Step {
-        let fragment = Fragment { total, offset };
+        let fragment = Fragment {
+            total,
+            offset,
+            parities: 0,
+        };
         let record = Record {
             stream: STREAM,
             repeat: false,

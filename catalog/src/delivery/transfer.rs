@@ -7,6 +7,7 @@ use ddx_wire::sample::{Fragment, SampleMeta};
 use ddx_wire::{Epoch, Seq, Time};
 
 use super::key;
+use super::parity;
 
 /// A sample in fragments, and the payload until nobody needs it any longer.
 #[derive(Debug)]
@@ -23,6 +24,19 @@ pub(super) struct Transfer<P> {
     left: Vec<u32>,
     begun: Time,
     again_all: bool,
+    parities: Parities,
+}
+
+/// Fragments that stand in for others.
+#[derive(Debug, Default)]
+struct Parities {
+    count: u8,
+    /// How many were sent.
+    sent: u8,
+    /// Made when the first is due: back to back.
+    bytes: Vec<u8>,
+    /// When the last left.
+    left: Time,
 }
 
 impl<P: AsRef<[u8]>> Transfer<P> {
@@ -39,7 +53,14 @@ impl<P: AsRef<[u8]>> Transfer<P> {
             left: vec![0; count],
             begun: now,
             again_all: false,
+            parities: Parities::default(),
         }
+    }
+
+    /// Sends so many parities after the fragments: how many there are may be read from [`Transfer::fragments`].
+    pub(super) fn protect(mut self, parities: u8) -> Self {
+        self.parities.count = parities;
+        self
     }
 
     /// Marks all as sent before, and sends only `parts`, offset and length, unless there are none.
@@ -69,7 +90,7 @@ impl<P: AsRef<[u8]>> Transfer<P> {
 
     /// Whether fragments wait that were never sent.
     pub(super) fn is_under_way(&self) -> bool {
-        self.next < self.left.len()
+        self.next < self.left.len() || self.parities.sent < self.parities.count
     }
 
     /// Whether fragments wait that were asked for.
@@ -81,7 +102,7 @@ impl<P: AsRef<[u8]>> Transfer<P> {
     pub(super) fn next_fragment(&mut self, now: Time) -> Option<(Fragment, &[u8])> {
         let index = self.next;
         if index >= self.left.len() {
-            return None;
+            return self.next_parity(now);
         }
         self.next += 1;
         self.fragment(index, now)
@@ -103,6 +124,12 @@ impl<P: AsRef<[u8]>> Transfer<P> {
             .saturating_add(len)
             .div_ceil(self.step)
             .min(self.next);
+        if self.parities.count > 0
+            && (self.is_under_way() || now.since(self.parities.left) < round_trip)
+        {
+            // Perhaps they make up for it.
+            return;
+        }
         let round_trip = u32::try_from(round_trip.as_millis()).unwrap_or(u32::MAX);
         let elapsed = self.elapsed(now);
         for index in first..end {
@@ -125,6 +152,31 @@ impl<P: AsRef<[u8]>> Transfer<P> {
         }
     }
 
+    fn next_parity(&mut self, now: Time) -> Option<(Fragment, &[u8])> {
+        let payload = self.payload.as_ref();
+        let parities = &mut self.parities;
+        if parities.sent >= parities.count {
+            return None;
+        }
+        if parities.bytes.is_empty() {
+            match parity::encode(payload, self.step, parities.count) {
+                Some(bytes) => parities.bytes = bytes,
+                None => parities.count = 0,
+            }
+        }
+        let at = usize::from(parities.sent) * self.step;
+        let bytes = parities.bytes.get(at..at + self.step)?;
+        parities.sent += 1;
+        parities.left = now;
+        let offset = self.left.len() * self.step + at;
+        let fragment = Fragment {
+            total: u32::try_from(payload.len()).ok()?,
+            offset: u32::try_from(offset).ok()?,
+            parities: parities.count,
+        };
+        Some((fragment, bytes))
+    }
+
     fn fragment(&mut self, index: usize, now: Time) -> Option<(Fragment, &[u8])> {
         let elapsed = self.elapsed(now);
         *self.left.get_mut(index)? = elapsed;
@@ -134,6 +186,7 @@ impl<P: AsRef<[u8]>> Transfer<P> {
         let fragment = Fragment {
             total: u32::try_from(bytes.len()).ok()?,
             offset: u32::try_from(start).ok()?,
+            parities: self.parities.count,
         };
         Some((fragment, bytes.get(start..end)?))
     }

@@ -49,8 +49,12 @@ pub struct Preamble {
 pub struct Fragment {
     /// Length of the whole sample, bytes.
     pub total: u32,
-    /// Payload bytes of the sample before this fragment.
+    /// Payload bytes of the sample before this fragment. From the sample's end on, rounded up to whole fragments, come
+    /// its parities.
     pub offset: u32,
+    /// How many parities protect the sample: fragments of its own, as long as those of the sample, of which each stands
+    /// in for any one that is lost.
+    pub parities: u8,
 }
 
 /// One record of a data datagram.
@@ -94,6 +98,19 @@ impl Preamble {
     }
 }
 
+impl Fragment {
+    /// Which parity of its sample a fragment of `len` bytes is, from 0; `None` for a part of the sample itself, and for
+    /// one that lies nowhere.
+    pub fn parity(&self, len: usize) -> Option<u8> {
+        let len = u32::try_from(len).ok().filter(|len| *len > 0)?;
+        let index = self.offset.checked_div(len)?;
+        let parity = index.checked_sub(self.total.div_ceil(len))?;
+        let parity = u8::try_from(parity).ok()?;
+        let is_aligned = self.offset.is_multiple_of(len);
+        (is_aligned && parity < self.parities).then_some(parity)
+    }
+}
+
 impl<'a> Record<'a> {
     /// Length of the record on the wire, bytes.
     pub fn encoded_len(&self) -> usize {
@@ -118,10 +135,12 @@ impl<'a> Record<'a> {
         let gone = if self.gone { GONE } else { 0 };
         // One growth of the vector for the head keeps the encoder at memcpy speed.
         let mut head = [0; RECORD_BYTES];
+        let parities = self.fragment.map_or(0, |fragment| fragment.parities);
         let words = [
             (u64::from(self.stream.0))
                 | (u64::from(len) << 32)
-                | (u64::from(fragment | repeat | gone) << 48),
+                | (u64::from(fragment | repeat | gone) << 48)
+                | (u64::from(parities) << 56),
             self.meta.epoch.0,
             self.meta.seq.0,
             self.meta.filtered,
@@ -148,7 +167,8 @@ impl<'a> Record<'a> {
             let limit = u32::try_from(MAX_SAMPLE_BYTES).unwrap_or(u32::MAX);
             !self.payload.is_empty()
                 && fragment.total <= limit
-                && end.is_some_and(|end| end <= fragment.total)
+                && (end.is_some_and(|end| end <= fragment.total)
+                    || fragment.parity(self.payload.len()).is_some())
         });
         let gone = !self.gone || (self.fragment.is_none() && self.payload.len() == 8);
         whole && gone && self.meta.seq.0 != 0
@@ -188,8 +208,8 @@ impl<'a> Records<'a> {
     }
 
     fn read(bytes: &'a [u8]) -> Option<(Record<'a>, &'a [u8])> {
-        let (&[s0, s1, s2, s3, l0, l1, flags, reserved], rest) = bytes.split_first_chunk()?;
-        if flags & !(FRAGMENT | REPEAT | GONE) != 0 || reserved != 0 {
+        let (&[s0, s1, s2, s3, l0, l1, flags, parities], rest) = bytes.split_first_chunk()?;
+        if flags & !(FRAGMENT | REPEAT | GONE) != 0 || (parities != 0 && flags & FRAGMENT == 0) {
             return None;
         }
         let (epoch, rest) = split_u64(rest)?;
@@ -204,7 +224,12 @@ impl<'a> Records<'a> {
             let (offset, rest) = rest.split_first_chunk()?;
             let total = u32::from_le_bytes(*total);
             let offset = u32::from_le_bytes(*offset);
-            (Some(Fragment { total, offset }), rest)
+            let fragment = Fragment {
+                total,
+                offset,
+                parities,
+            };
+            (Some(fragment), rest)
         };
         let len = usize::from(u16::from_le_bytes([l0, l1]));
         let (payload, rest) = rest.split_at_checked(len)?;
@@ -282,7 +307,11 @@ mod tests {
 
     fn fragment(total: u32, offset: u32, payload: &[u8]) -> Record<'_> {
         Record {
-            fragment: Some(Fragment { total, offset }),
+            fragment: Some(Fragment {
+                total,
+                offset,
+                parities: 0,
+            }),
             ..record(payload)
         }
     }
@@ -309,6 +338,34 @@ mod tests {
         let bytes = encoded(fragment(0x102, 0x100, b"ab"));
         assert_eq!(bytes[4..8], [2, 0, 3, 0]);
         assert_eq!(bytes[48..], [2, 1, 0, 0, 0, 1, 0, 0, b'a', b'b']);
+    }
+
+    #[test]
+    fn parities_come_after_the_end_of_their_sample() {
+        let parity = |offset, parities, payload| Record {
+            fragment: Some(Fragment {
+                total: 0x103,
+                offset,
+                parities,
+            }),
+            ..record(payload)
+        };
+        // The sample takes 130 fragments of 2 bytes, the last of them short.
+        let good = parity(0x106, 2, b"pq");
+        let bytes = encoded(good);
+        assert_eq!(bytes[4..8], [2, 0, 3, 2]);
+        assert_eq!(bytes[48..], [3, 1, 0, 0, 6, 1, 0, 0, b'p', b'q']);
+        assert_eq!(Records::new(&bytes).next(), Some(Ok(good)));
+        assert_eq!(good.fragment.unwrap().parity(2), Some(1));
+        assert_eq!(parity(0x104, 1, b"pq").fragment.unwrap().parity(2), Some(0));
+        for bad in [
+            parity(0x106, 1, b"pq"),
+            parity(0x105, 2, b"pq"),
+            parity(0x105, 2, b"p"),
+            parity(0x103, 0, b"pq"),
+        ] {
+            assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed), "{bad:?}");
+        }
     }
 
     #[test]

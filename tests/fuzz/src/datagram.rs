@@ -776,6 +776,7 @@ fn records(input: &mut Input<'_>) -> Vec<u8> {
         let fragment = input.flag().then(|| Fragment {
             total: u32::from(input.short()),
             offset: u32::from(input.short()),
+            parities: input.byte(),
         });
         let gone = input.flag();
         let payload = input.chunk();
