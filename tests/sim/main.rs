@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `directory.rs` | everybody learns everything, soon, also after a partition; nobody alive is declared dead; idling is cheap |
 //! | `delivery.rs` | the last value arrives; nothing is sent twice, too often, to nobody or too large |
+//! | `links.rs` | the same over each link profile, and a profile does what it says |
 //! | `paths.rs` | samples flow on when an address, a link or a network of several goes |
 //! | `chance.rs` | the same under whatever a seed thinks up, with each sample judged |
 //!
@@ -18,6 +19,7 @@
 mod chance;
 mod delivery;
 mod directory;
+mod links;
 mod paths;
 mod seeds;
 

@@ -2,7 +2,8 @@
 //!
 //! Everything is a function of the seed. Each host has a boot clock with its own start and drift, a model store, and the
 //! real control plane, sender and receiver, driven as the daemon drives them. Datagrams, which are sealed as in earnest,
-//! are lost, delayed, reordered, duplicated and cut off by partitions; a multicast is carried to each member by itself.
+//! pass a [line](crate::link) to each receiver, a multicast to each member by itself, and are cut off by partitions; a
+//! host with a [profile](crate::link::Profile) has a line of its own for what it sends, too.
 //! Promises that must hold at every sample are checked as it passes, and [`Sim::broken`] lists those that did not.
 
 use std::cmp::Reverse;
@@ -16,6 +17,8 @@ use ddx_wire::{
     Contract, DomainId, Epoch, HostId, HostName, Incarnation, ItemName, Seq, Tag, Time,
 };
 
+use crate::link::{Books, Class, Profile};
+
 mod host;
 mod net;
 mod networks;
@@ -27,7 +30,7 @@ pub use crate::random::Random;
 pub use host::Host;
 use host::HostClock;
 pub use net::Link;
-use net::{CONTROL_PORT, DATA_PORT, Net, Way};
+use net::{CONTROL_PORT, DATA_PORT, Net, Target, Way};
 use networks::Networks;
 pub use tx::Counts;
 
@@ -89,6 +92,13 @@ struct Interest {
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Action {
     Wake(usize),
+    /// A datagram has left its sender's line and goes to whoever it is for.
+    Switch {
+        from: usize,
+        network: usize,
+        to: Target,
+        bytes: Vec<u8>,
+    },
     Deliver {
         to: usize,
         from: usize,
@@ -117,7 +127,8 @@ impl Sim {
     /// Starts all hosts within the first ten milliseconds.
     pub fn new(setup: Setup) -> Self {
         let mut random = Random::new(setup.seed);
-        let net = Net::new(setup.link, Random::new(random.next()), setup.hosts);
+        let chance = Random::new(random.next());
+        let net = Net::new(setup.link, chance, setup.hosts, setup.networks);
         let networks = Networks::new(setup.hosts, setup.networks);
         let mut hosts = Vec::new();
         for index in 0..setup.hosts {
@@ -262,9 +273,21 @@ impl Sim {
         Some(self.networks.resolve(peer.addr)?.1)
     }
 
-    /// Changes the network for datagrams that are sent from now on.
+    /// Changes all networks for datagrams that are sent from now on, also for hosts with a profile.
     pub fn set_link(&mut self, link: Link) {
-        self.net.link = link;
+        self.net.set_all(link);
+    }
+
+    /// Gives a host a link of its own to a network, up and down, for datagrams that are sent from now on.
+    ///
+    /// The same profile means the same drops, as in the laboratory.
+    pub fn set_profile(&mut self, index: usize, network: usize, profile: &Profile) {
+        self.net.set(index, network, profile);
+    }
+
+    /// What became of datagrams on a host's link to a network; up counts since it has a profile.
+    pub fn books(&self, index: usize, network: usize) -> Books {
+        self.net.books(index, network)
     }
 
     /// Opens a writer of an item under a host's prefix: a new item, or a new epoch of one that is there.
@@ -358,6 +381,12 @@ impl Sim {
             self.now = self.now.max(at);
             match action {
                 Action::Wake(index) => self.wake(index),
+                Action::Switch {
+                    from,
+                    network,
+                    to,
+                    bytes,
+                } => self.switch((from, network), to, &bytes),
                 Action::Deliver {
                     to,
                     from,
@@ -435,18 +464,16 @@ impl Sim {
         for (to, bytes) in out.control {
             self.sent_bytes += u64::try_from(bytes.len()).unwrap_or(0);
             match to {
-                Dest::Addr(to) => self.send(index, to, &bytes),
+                Dest::Addr(to) => self.send_to(index, to, &bytes),
                 Dest::Beacon => {
                     for network in 0..self.networks.count() {
-                        for to in (0..self.hosts.len()).filter(|to| *to != index) {
-                            self.post((index, network), to, Way::Control, &bytes);
-                        }
+                        self.send((index, network), Target::Beacon, &bytes);
                     }
                 }
             }
         }
         for (to, bytes) in out.samples {
-            self.send(index, to, &bytes);
+            self.send_to(index, to, &bytes);
         }
         for (tag, offset) in out.clocks {
             let other = self.tags.get(&tag).map(|other| self.local(*other));
@@ -479,43 +506,79 @@ impl Sim {
         self.broken.extend(broken);
     }
 
-    fn send(&mut self, from: usize, to: SocketAddr, bytes: &[u8]) {
+    fn send_to(&mut self, from: usize, to: SocketAddr, bytes: &[u8]) {
         if bytes.len() > MAX_DATAGRAM_BYTES {
             let text = format!("a datagram of {} bytes to {to}", bytes.len());
             self.broken.push((self.now(), from, text));
         }
         if to.ip().is_multicast() {
-            // The sender hears its own, too, if it is a member.
+            // The sender hears its own, too, if it is a member: inside of the host, where nothing is lost.
+            self.push_delivery(self.now, (from, 0), from, Way::Group(to), bytes);
             for network in 0..self.networks.count() {
-                for member in 0..self.hosts.len() {
-                    self.post((from, network), member, Way::Group(to), bytes);
-                }
+                self.send((from, network), Target::Group(to), bytes);
             }
         } else if let Some((first, network)) = self.networks.resolve(to)
             && let Some((to, way)) = net::socket(first)
         {
-            self.post((from, network), to, way, bytes);
+            self.send((from, network), Target::Host(to, way), bytes);
         }
     }
 
-    fn post(&mut self, (from, network): (usize, usize), to: usize, way: Way, bytes: &[u8]) {
-        let carried = [from, to]
-            .iter()
-            .all(|host| self.networks.carries(*host, network));
-        if !self.net.reaches(from, to) || !carried {
+    fn send(&mut self, (from, network): (usize, usize), to: Target, bytes: &[u8]) {
+        if !self.networks.carries(from, network) {
             return;
         }
-        for span in self.net.copies() {
-            let bytes = bytes.to_vec();
-            let action = Action::Deliver {
-                to,
+        let now = self.now();
+        let Some(line) = self.net.up(from, network) else {
+            return self.switch((from, network), to, bytes);
+        };
+        for arrival in line.carry(net::packet_bytes(bytes), to.class(), now) {
+            let action = Action::Switch {
                 from,
                 network,
-                way,
-                bytes,
+                to,
+                bytes: bytes.to_vec(),
             };
-            self.push(self.now + span, action);
+            self.push(nanos(arrival), action);
         }
+    }
+
+    fn switch(&mut self, (from, network): (usize, usize), to: Target, bytes: &[u8]) {
+        let (others, way) = match to {
+            Target::Host(host, way) => (host..host + 1, way),
+            Target::Beacon => (0..self.hosts.len(), Way::Control),
+            Target::Group(group) => (0..self.hosts.len(), Way::Group(group)),
+        };
+        let now = self.now();
+        for other in others {
+            let is_itself = other == from && to.class() == Class::Multicast;
+            let carries = self.networks.carries(other, network);
+            if is_itself || !carries || !self.net.reaches(from, other) {
+                continue;
+            }
+            let line = self.net.down(other, network);
+            for arrival in line.carry(net::packet_bytes(bytes), to.class(), now) {
+                self.push_delivery(nanos(arrival), (from, network), other, way, bytes);
+            }
+        }
+    }
+
+    fn push_delivery(
+        &mut self,
+        at: u64,
+        (from, network): (usize, usize),
+        to: usize,
+        way: Way,
+        bytes: &[u8],
+    ) {
+        let action = Action::Deliver {
+            to,
+            from,
+            network,
+            way,
+            bytes: bytes.to_vec(),
+        };
+        self.push(at, action);
     }
 
     fn reader_left(&mut self, name: &ItemName) {

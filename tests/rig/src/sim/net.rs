@@ -1,9 +1,9 @@
-//! The simulated network: what becomes of a datagram on its way.
+//! The simulated networks: a line from each host to each and one back, and who is cut off from whom.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use super::nanos;
+use crate::link::{Books, Class, Config, Line, Loss, Profile};
 use crate::random::Random;
 
 /// Port of every host's control socket.
@@ -11,7 +11,7 @@ pub(super) const CONTROL_PORT: u16 = 7000;
 /// Port on which every host receives unicast samples.
 pub(super) const DATA_PORT: u16 = 7001;
 
-/// What the network does to a datagram.
+/// What a network does to a datagram on its way to a host: a [`Config`] in four words.
 #[derive(Clone, Copy, Debug)]
 pub struct Link {
     /// Share of datagrams that are lost.
@@ -22,6 +22,17 @@ pub struct Link {
     pub delay: Duration,
     /// Further time on the way, at most; more than the spacing of datagrams reorders them.
     pub jitter: Duration,
+}
+
+/// To whom a datagram is sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Target {
+    /// To this socket of one host.
+    Host(usize, Way),
+    /// To every host's control socket.
+    Beacon,
+    /// To this group of samples.
+    Group(SocketAddr),
 }
 
 /// By which way a datagram comes.
@@ -37,10 +48,18 @@ pub(super) enum Way {
 
 /// All that lies between the hosts.
 pub(super) struct Net {
-    pub(super) link: Link,
-    pub(super) random: Random,
+    /// By host, then by network.
+    ends: Vec<Vec<End>>,
     /// Hosts hear each other only within one group.
     groups: Vec<usize>,
+}
+
+/// A host's end of one network.
+struct End {
+    /// From the host, where that does anything at all.
+    up: Option<Line>,
+    /// To the host, from all others: its own state, also for what is sent to a group.
+    down: Line,
 }
 
 impl Link {
@@ -55,12 +74,53 @@ impl Link {
     }
 }
 
-impl Net {
-    pub(super) fn new(link: Link, random: Random, hosts: usize) -> Self {
+impl From<Link> for Config {
+    fn from(link: Link) -> Self {
         Self {
-            link,
-            random,
+            loss: Loss::random(link.loss),
+            duplicate: link.duplicates,
+            delay: link.delay + link.jitter / 2,
+            jitter: link.jitter / 2,
+            reorder: 1.0,
+            ..Self::default()
+        }
+    }
+}
+
+impl Net {
+    pub(super) fn new(link: Link, mut random: Random, hosts: usize, networks: usize) -> Self {
+        let mut end = || End {
+            up: None,
+            down: Line::new(link.into(), random.next()),
+        };
+        Self {
+            ends: (0..hosts)
+                .map(|_| (0..networks.max(1)).map(|_| end()).collect())
+                .collect(),
             groups: vec![0; hosts],
+        }
+    }
+
+    pub(super) fn set_all(&mut self, link: Link) {
+        for end in self.ends.iter_mut().flatten() {
+            end.up = None;
+            end.down.configure(link.into());
+        }
+    }
+
+    pub(super) fn set(&mut self, index: usize, network: usize, profile: &Profile) {
+        let (up, down) = profile.seeds(index);
+        let end = &mut self.ends[index][network];
+        let idle = end.up.take().unwrap_or(Line::new(profile.up, up));
+        end.up.insert(idle).restart(profile.up, up);
+        end.down.restart(profile.down, down);
+    }
+
+    pub(super) fn books(&self, index: usize, network: usize) -> Books {
+        let End { up, down } = &self.ends[index][network];
+        Books {
+            up: up.as_ref().map(Line::counters).unwrap_or_default(),
+            down: down.counters(),
         }
     }
 
@@ -74,18 +134,29 @@ impl Net {
         self.groups[from] == self.groups[to]
     }
 
-    /// How long each copy that arrives is on the way: none when it is lost.
-    pub(super) fn copies(&mut self) -> Vec<u64> {
-        let count = 1 + usize::from(self.random.chance(self.link.duplicates));
-        let mut copies = Vec::with_capacity(count);
-        for _ in 0..count {
-            if !self.random.chance(self.link.loss) {
-                let jitter = self.random.below(nanos(self.link.jitter).max(1));
-                copies.push(nanos(self.link.delay) + jitter);
-            }
-        }
-        copies
+    /// Returns the line from a host, if it has one.
+    pub(super) fn up(&mut self, from: usize, network: usize) -> Option<&mut Line> {
+        self.ends[from][network].up.as_mut()
     }
+
+    /// Returns the line to a host.
+    pub(super) fn down(&mut self, to: usize, network: usize) -> &mut Line {
+        &mut self.ends[to][network].down
+    }
+}
+
+impl Target {
+    pub(super) fn class(self) -> Class {
+        match self {
+            Self::Host(..) => Class::Unicast,
+            Self::Beacon | Self::Group(_) => Class::Multicast,
+        }
+    }
+}
+
+/// Returns the length of a datagram's IP packet.
+pub(super) fn packet_bytes(datagram: &[u8]) -> usize {
+    datagram.len() + 28
 }
 
 /// The address of a host.
