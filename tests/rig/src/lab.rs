@@ -100,6 +100,8 @@ impl Lab {
         check_names(hosts)?;
         let mut shell = Shell::start()?;
         let holders = hold_namespaces(&mut shell, hosts)?;
+        shell.run(&cables_script(hosts.len()))?;
+        cut_up_runs(&shell, hosts.len())?;
         shell.run(&wiring_script(&holders))?;
         shell.run(&nft(&switch::base_rules(hosts.len())))?;
         Ok(Self {
@@ -383,30 +385,44 @@ fn hold_namespaces(shell: &mut Shell, hosts: &[&str]) -> Result<Vec<u32>, Error>
         .collect())
 }
 
-/// Returns the script that makes the bridge and gives each host its link and address.
-fn wiring_script(holders: &[u32]) -> String {
+/// Returns the script that makes the bridge and each host's cable, of which the host's end is still here, as `e1` and up.
+fn cables_script(hosts: usize) -> String {
     // Bridged packets would otherwise pass the machine's IP firewall hooks as well.
     let mut script = "for knob in /proc/sys/net/bridge/bridge-nf-call-*; do\n\
                       [ ! -e \"$knob\" ] || echo 0 >\"$knob\"\n\
                       done\n"
         .to_owned();
     let mut batch = switch::bridge_batch();
-    for (index, holder) in holders.iter().enumerate() {
-        let port = index + 1;
+    for port in 1..=hosts {
         batch.push_str(&format!(
-            "link add p{port} type veth peer name eth0 netns {holder}\nlink set p{port} master br0 up\n"
+            "link add p{port} type veth peer name e{port}\nlink set p{port} master br0 up\n"
         ));
     }
     script.push_str(NO_IPV6);
     script.push_str(&format!("ip -batch - <<'END'\n{batch}END\n"));
+    script
+}
+
+/// A batch of datagrams, or a run of TCP segments, reaches the switch as packets, so that each is counted and lost on its own.
+fn cut_up_runs(shell: &Shell, hosts: usize) -> Result<(), Error> {
+    let switch = splice::open(shell, &format!("/proc/{}/ns/net", shell.init_pid()))?;
+    for port in 1..=hosts {
+        let device = format!("e{port}");
+        let refused = Error::io(format!("turn segmentation of {device} off"));
+        switch.turn_segmentation_off(&device).map_err(refused)?;
+    }
+    Ok(())
+}
+
+/// Returns the script that gives each host its end of the cable and its address.
+fn wiring_script(holders: &[u32]) -> String {
+    let mut script = String::new();
     for (index, holder) in holders.iter().enumerate() {
-        let address = address_of(index);
-        // One segment at most: a batch of datagrams reaches the switch as datagrams, so that each is counted
-        // and lost on its own.
+        let (port, address) = (index + 1, address_of(index));
         script.push_str(&format!(
-            "nsenter --target {holder} --net ip -batch - <<'END'\n\
+            "ip link set e{port} netns {holder} name eth0\n\
+             nsenter --target {holder} --net ip -batch - <<'END'\n\
              link set lo up\n\
-             link set eth0 gso_max_segs 1\n\
              address add {address}/24 dev eth0\n\
              link set eth0 up\n\
              route add 224.0.0.0/4 dev eth0\n\

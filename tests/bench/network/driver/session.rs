@@ -70,7 +70,6 @@ impl Session {
             return Ok(None);
         };
         for host in lab.hosts() {
-            host.shell(SEGMENTS)?;
             host.shell(IP_FRAGMENTS)?;
         }
         let mut daemons = Vec::new();
@@ -329,10 +328,6 @@ fn said(program: &Process, key: &str) -> Option<u64> {
     line[start.len()..].trim_end_matches('}').parse().ok()
 }
 
-/// The lab hands the kernel one segment at a time, so that each is counted and lost on its own, and under that limit TCP
-/// crawls. Cut up before the link, whole runs may pass the stack, of TCP and UDP alike, and the switch still sees segments.
-const SEGMENTS: &str = "ethtool -K eth0 tx-tcp-segmentation off tx-udp-segmentation off >/dev/null
-                        ip link set eth0 gso_max_segs 65535";
 /// What DDS and LCM send in IP fragments leaves the kernel with torsos when one is lost. By default they fill its 4 MiB in a
 /// second, and then for half a minute no fragmented datagram gets through; users of DDS are told to raise this.
 const IP_FRAGMENTS: &str = "echo 536870912 >/proc/sys/net/ipv4/ipfrag_high_thresh

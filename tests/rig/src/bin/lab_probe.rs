@@ -7,8 +7,8 @@
 )]
 
 use std::error::Error;
-use std::io::{self, Read};
-use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::io::{self, Read, Write};
+use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream, UdpSocket};
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ use ddx_rig::lab::Lab;
 use ddx_rig::link::Profile;
 
 const USAGE: &str = "usage: lab_probe echo PORT | ping ADDRESS COUNT | send ADDRESS COUNT | join GROUP PORT \
-                     | train ADDRESS COUNT INTERVAL_US BYTES | trace PORT [GROUP] | wire | hold HOST...";
+                     | train ADDRESS COUNT INTERVAL_US BYTES | trace PORT [GROUP] | sink PORT | pour ADDRESS BYTES | wire | hold HOST...";
 
 fn main() -> Result<(), Box<dyn Error>> {
     let words: Vec<String> = std::env::args().skip(1).collect();
@@ -39,6 +39,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         ),
         ["trace", port] => trace(port.parse()?, None),
         ["trace", port, group] => trace(port.parse()?, Some(group.parse()?)),
+        ["sink", port] => sink(port.parse()?),
+        ["pour", to, bytes] => pour(to.parse()?, bytes.parse()?),
         ["wire"] => wire(),
         ["hold", hosts @ ..] => hold(hosts),
         _ => Err(USAGE.into()),
@@ -150,6 +152,29 @@ fn trace(port: u16, group: Option<Ipv4Addr>) -> Result<(), Box<dyn Error>> {
         println!("{number} {delay} {at}");
     }
     println!("end");
+    Ok(())
+}
+
+/// Takes all bytes of one connection, and answers with how many there were.
+fn sink(port: u16) -> Result<(), Box<dyn Error>> {
+    let listener = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port))?;
+    println!("ready");
+    let (mut stream, _) = listener.accept()?;
+    let bytes = io::copy(&mut stream, &mut io::sink())?;
+    stream.write_all(&bytes.to_le_bytes())?;
+    Ok(())
+}
+
+/// Sends so many bytes by one connection and tells how long it took until all were there.
+fn pour(to: SocketAddrV4, bytes: u64) -> Result<(), Box<dyn Error>> {
+    let mut stream = TcpStream::connect(to)?;
+    let start = Instant::now();
+    io::copy(&mut io::repeat(7).take(bytes), &mut stream)?;
+    stream.shutdown(std::net::Shutdown::Write)?;
+    let mut answer = [0; 8];
+    stream.read_exact(&mut answer)?;
+    let arrived = u64::from_le_bytes(answer);
+    println!("{arrived} in {} us", start.elapsed().as_micros());
     Ok(())
 }
 

@@ -14,6 +14,7 @@ use std::mem::MaybeUninit;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
 use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
+use std::ptr;
 
 use rustix::net::{
     AddressFamily, RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer,
@@ -98,24 +99,69 @@ impl PacketSocket {
     ///
     /// The device is one of the namespace in which the socket was opened.
     pub(super) fn turn_offload_off(&self, device: &str) -> io::Result<()> {
+        for command in OFFLOADS {
+            self.set_to_zero(device, command)?;
+        }
+        Ok(())
+    }
+
+    /// Has the kernel cut runs of segments up before they enter the device, so that what passes it are packets as on a
+    /// cable. Until then they stay whole, which is what makes TCP fast.
+    ///
+    /// The device is one of the namespace in which the socket was opened.
+    pub(super) fn turn_segmentation_off(&self, device: &str) -> io::Result<()> {
+        self.set_to_zero(device, SET_TCP_SEGMENTATION)?;
+        let mut names = EthtoolStrings {
+            command: GET_STRINGS,
+            set: FEATURES,
+            length: 0,
+            names: [[0; 32]; FEATURES_MAX],
+        };
+        let mut counted = EthtoolSet {
+            command: GET_SET_INFO,
+            reserved: 0,
+            mask: 1 << FEATURES,
+            length: 0,
+        };
+        self.ethtool(device, &mut counted)?;
+        if usize::try_from(counted.length).is_ok_and(|length| length > FEATURES_MAX) {
+            return Err(io::Error::other("devices have more features than expected"));
+        }
+        self.ethtool(device, &mut names)?;
+        let is_it = |name: &[u8; 32]| name.starts_with(UDP_SEGMENTATION);
+        // A kernel without the feature cuts up by itself.
+        let Some(place) = names.names.iter().position(is_it) else {
+            return Ok(());
+        };
+        let words = counted.length.div_ceil(32);
+        let mut change = EthtoolFeatures {
+            command: SET_FEATURES,
+            words,
+            changes: [[0; 2]; FEATURES_MAX / 32],
+        };
+        change.changes[place / 32][0] = 1 << (place % 32);
+        self.ethtool(device, &mut change)
+    }
+
+    fn set_to_zero(&self, device: &str, command: u32) -> io::Result<()> {
+        self.ethtool(device, &mut EthtoolValue { command, data: 0 })
+    }
+
+    fn ethtool<C: EthtoolCommand>(&self, device: &str, command: &mut C) -> io::Result<()> {
         let mut name = [0; libc::IFNAMSIZ];
         for (to, from) in name[..libc::IFNAMSIZ - 1].iter_mut().zip(device.bytes()) {
             *to = c_char::from_ne_bytes([from]);
         }
-        for command in OFFLOADS {
-            let mut value = EthtoolValue { command, data: 0 };
-            let mut request = libc::ifreq {
-                ifr_name: name,
-                ifr_ifru: libc::__c_anonymous_ifr_ifru {
-                    ifru_data: (&raw mut value).cast(),
-                },
-            };
-            // SAFETY: the descriptor is open; SIOCETHTOOL takes a `struct ifreq` whose data is, for these
-            // commands, a `struct ethtool_value`; both live until the call returns.
-            let status = unsafe { libc::ioctl(self.0.as_raw_fd(), SIOCETHTOOL, &raw mut request) };
-            checked(status)?;
-        }
-        Ok(())
+        let mut request = libc::ifreq {
+            ifr_name: name,
+            ifr_ifru: libc::__c_anonymous_ifr_ifru {
+                ifru_data: ptr::from_mut(command).cast(),
+            },
+        };
+        // SAFETY: the descriptor is open; SIOCETHTOOL takes a `struct ifreq` whose data is what its command says, which
+        // `EthtoolCommand` promises; both live until the call returns.
+        let status = unsafe { libc::ioctl(self.0.as_raw_fd(), SIOCETHTOOL, &raw mut request) };
+        checked(status)
     }
 
     /// Returns how many frames the kernel dropped because the buffer was full, since the last call.
@@ -208,6 +254,14 @@ fn length_of<T>(_: &T) -> libc::socklen_t {
     libc::socklen_t::try_from(size_of::<T>()).unwrap_or(0)
 }
 
+/// A structure that begins with an ethtool command and has room for all that the kernel reads and writes for it.
+trait EthtoolCommand {}
+
+impl EthtoolCommand for EthtoolValue {}
+impl EthtoolCommand for EthtoolSet {}
+impl EthtoolCommand for EthtoolStrings {}
+impl EthtoolCommand for EthtoolFeatures {}
+
 /// `struct ethtool_value` of the kernel.
 #[repr(C)]
 struct EthtoolValue {
@@ -215,10 +269,47 @@ struct EthtoolValue {
     data: u32,
 }
 
+/// `struct ethtool_sset_info` for one set.
+#[repr(C)]
+struct EthtoolSet {
+    command: u32,
+    reserved: u32,
+    mask: u64,
+    length: u32,
+}
+
+/// `struct ethtool_gstrings`.
+#[repr(C)]
+struct EthtoolStrings {
+    command: u32,
+    set: u32,
+    length: u32,
+    names: [[u8; 32]; FEATURES_MAX],
+}
+
+/// `struct ethtool_sfeatures`: for each 32 features which to change, and to what.
+#[repr(C)]
+struct EthtoolFeatures {
+    command: u32,
+    words: u32,
+    changes: [[u32; 2]; FEATURES_MAX / 32],
+}
+
 const SIOCETHTOOL: libc::Ioctl = 0x8946;
 
 /// Receive and transmit checksums, scatter-gather, TSO, GSO, GRO: `ETHTOOL_S…` of the kernel.
 const OFFLOADS: [u32; 6] = [0x15, 0x17, 0x19, 0x1f, 0x24, 0x2c];
+
+/// `ETHTOOL_STSO`, which is one of those.
+const SET_TCP_SEGMENTATION: u32 = 0x1f;
+/// `ETHTOOL_GSTRINGS`, `ETHTOOL_GSSET_INFO`, `ETHTOOL_SFEATURES` and `ETH_SS_FEATURES` of the kernel.
+const GET_STRINGS: u32 = 0x1b;
+const GET_SET_INFO: u32 = 0x37;
+const SET_FEATURES: u32 = 0x3b;
+const FEATURES: u32 = 4;
+/// Twice what kernels have; checked, since the kernel writes as many as it has.
+const FEATURES_MAX: usize = 128;
+const UDP_SEGMENTATION: &[u8] = b"tx-udp-segmentation\0";
 
 /// `AF_PACKET`, as the address has it.
 const PACKET_FAMILY: u16 = 17;

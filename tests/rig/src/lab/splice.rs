@@ -68,7 +68,7 @@ pub(super) fn has_netem(shell: &mut Shell) -> bool {
         .is_ok()
 }
 
-fn open(shell: &Shell, net: &str) -> Result<PacketSocket, Error> {
+pub(super) fn open(shell: &Shell, net: &str) -> Result<PacketSocket, Error> {
     let file = |path: &str| File::open(path).map_err(Error::io(format!("open {path}")));
     let user = match shell.rights() {
         Rights::Root => None,
