@@ -235,7 +235,10 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         let flow = self.flows.get_mut(&stream)?;
         let mut offered = None;
         if let Want::At(..) = fetch.want {
-            let filled = flow.fill(found.map(|(meta, _)| (meta.epoch, meta.seq)))?;
+            let Some(filled) = flow.fill(found.map(|(meta, _)| (meta.epoch, meta.seq))) else {
+                self.take_turns(stream);
+                return None;
+            };
             if filled.gone > 0 {
                 let meta = SampleMeta {
                     epoch: filled.epoch,
@@ -626,7 +629,9 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         }
     }
 
+    /// Lists a flow where it has something to do, and nowhere else: what heads a list for nothing would hide the others.
     fn take_turns(&mut self, stream: StreamId) {
+        self.forget_turns(stream);
         if let Some(flow) = self.flows.get(&stream) {
             let entry = (flow.turn, stream);
             if flow.wants_fetch() {

@@ -300,6 +300,45 @@ fn a_full_path_takes_the_newest_when_it_has_room() {
 }
 
 #[test]
+fn each_of_many_streams_that_wait_for_a_full_path_gets_its_newest_sample_through() {
+    let mut sender = sender(Via::Unicast, 1);
+    let streams = (STREAM.0..STREAM.0 + 10).map(StreamId);
+    for stream in streams.clone() {
+        sender.open(stream, &route(Via::Unicast, 1), Time(0));
+    }
+    // Nothing is reported, so that the rate falls below what is written; then nothing is written any more.
+    let mut sent = BTreeMap::new();
+    let mut now = Time(0);
+    for seq in 1..=3_000 {
+        now = now + MS;
+        for stream in streams.clone() {
+            sender.write(stream, &meta(1, seq), &vec![0; 64], now);
+            // Whoever confirms all that came does not cause a repeat.
+            sender.held(stream, READER, Epoch(1), Seq(seq), now);
+        }
+        let end = if seq < 3_000 { now } else { now + 1_000 * MS };
+        loop {
+            while let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() {
+                let found = match fetch.want {
+                    Want::After(_, Seq(last)) => seq.min(last.max(seq - 8) + 1),
+                    Want::Newest | Want::At(..) => seq,
+                };
+                sent.insert(fetch.stream, found);
+                sender.fetched(&fetch, Some((&meta(1, found), &vec![0; 64])), now);
+            }
+            sender.flush(now);
+            if drain(&mut sender).is_empty() {
+                let next = sender.poll_timeout().filter(|(at, _)| *at <= end);
+                let Some((at, _)) = next else { break };
+                now = at.max(now);
+                sender.handle_timeout(now);
+            }
+        }
+    }
+    assert_eq!(sent, streams.map(|stream| (stream, 3_000)).collect());
+}
+
+#[test]
 fn what_is_too_old_is_not_sent() {
     let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
     let mut route = route(Via::Unicast, 1);
