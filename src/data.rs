@@ -4,6 +4,7 @@
 //! sleeps on its bell and `rx` in `poll`. Both own their machines and take orders from the control loop over bounded
 //! queues.
 
+pub(crate) mod board;
 pub(crate) mod mailbox;
 pub(crate) mod rx;
 pub(crate) mod tx;

@@ -3,6 +3,7 @@
 //! The loop is the one place that owns the [`Catalog`](ddx_catalog::Catalog). It makes one mutation, drains all effects, then makes the next.
 //! Without a key there is no catalog, no data thread and no socket on any network: the host serves itself.
 
+mod books;
 mod keeper;
 mod network;
 mod state;

@@ -39,7 +39,7 @@ mod reception;
 mod sender;
 mod transfer;
 
-pub use books::Books;
+pub use books::{Books, SentBooks, SourceBooks};
 pub(crate) use congestion::Progress;
 pub use receiver::{Receiver, ReceiverConfig, ReceiverCounters};
 pub use sender::{Sender, SenderConfig, SenderCounters, StreamCounters};
@@ -190,6 +190,17 @@ pub struct Received<'a> {
     pub meta: SampleMeta,
     /// Its bytes.
     pub payload: &'a [u8],
+    /// What became at the source of the samples between this one and the one before; the others were lost.
+    pub passed: Passed,
+}
+
+/// Samples that a source did not send, by cause. Each of a stream lies before some sample that was delivered.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Passed {
+    /// Gave way to newer ones in the writer's ring.
+    pub overwritten: u64,
+    /// Were left out because of the contract, or because the link is slower than the stream.
+    pub filtered: u64,
 }
 
 /// Why a machine wants to be called again.

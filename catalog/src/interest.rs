@@ -73,6 +73,8 @@ enum Phase {
         arrives: bool,
         /// Since when samples arrive by any path, after the group was granted.
         flows: Option<Time>,
+        since: Time,
+        left_group: Option<SocketAddr>,
     },
 }
 
@@ -107,6 +109,10 @@ pub struct StreamIn {
     pub group: Option<SocketAddr>,
     /// Whether samples arrive by that group.
     pub arrives: bool,
+    /// Since when it comes this way.
+    pub since: Option<Time>,
+    /// The group that it came by, or was to come by, before its owner gave that up.
+    pub left_group: Option<SocketAddr>,
 }
 
 impl Interest {
@@ -243,6 +249,12 @@ impl Interest {
                 continue;
             };
             let (name, contract) = (name.clone(), want.contract);
+            let left_group = match &want.phase {
+                Phase::Granted {
+                    group, left_group, ..
+                } => group.or(*left_group).filter(|_| entry.group.is_none()),
+                Phase::Pending | Phase::Asked { .. } => None,
+            };
             let granted = Phase::Granted {
                 owner: from,
                 name: own_name,
@@ -250,6 +262,8 @@ impl Interest {
                 group: entry.group,
                 arrives: false,
                 flows: None,
+                since: now,
+                left_group,
             };
             let before = std::mem::replace(&mut want.phase, granted);
             let same = matches!(before, Phase::Granted { stream: known, .. } if known == stream);
@@ -423,22 +437,33 @@ impl Interest {
 
     pub(crate) fn streams(&self) -> impl Iterator<Item = StreamIn> {
         self.wants.iter().map(|(name, want)| {
-            let (stream, group, arrives) = match &want.phase {
+            let asked = StreamIn {
+                name: name.clone(),
+                tag: want.phase.owner(),
+                stream: None,
+                contract: want.contract,
+                group: None,
+                arrives: false,
+                since: None,
+                left_group: None,
+            };
+            match &want.phase {
                 Phase::Granted {
                     stream,
                     group,
                     arrives,
+                    since,
+                    left_group,
                     ..
-                } => (Some(*stream), *group, *arrives),
-                Phase::Pending | Phase::Asked { .. } => (None, None, false),
-            };
-            StreamIn {
-                name: name.clone(),
-                tag: want.phase.owner(),
-                stream,
-                contract: want.contract,
-                group,
-                arrives,
+                } => StreamIn {
+                    stream: Some(*stream),
+                    group: *group,
+                    arrives: *arrives,
+                    since: Some(*since),
+                    left_group: *left_group,
+                    ..asked
+                },
+                Phase::Pending | Phase::Asked { .. } => asked,
             }
         })
     }

@@ -50,4 +50,4 @@ pub use hosts::HostState;
 pub use interest::StreamIn;
 pub use outbox::Dest;
 pub use paths::PathStatus;
-pub use streams::{Choice, StreamOut};
+pub use streams::{Choice, Shuns, StreamOut};

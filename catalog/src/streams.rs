@@ -62,6 +62,8 @@ struct Lease {
     unicast_until: Time,
     /// Since when it is served as it is.
     since: Time,
+    /// The last trial of the group brought nothing.
+    silent: bool,
 }
 
 struct Stream {
@@ -93,8 +95,22 @@ pub struct Choice {
     pub unicast_loss: f64,
     /// Share of datagrams lost by the item's group, if any came or should have.
     pub group_loss: Option<f64>,
-    /// Whether the group is not used because it does not work.
-    pub shuns_group: bool,
+    /// Why the group is not used; none where it is, and where it would serve one reader alone.
+    pub shuns: Option<Shuns>,
+}
+
+/// Why a reading host is not served by a group.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shuns {
+    /// Samples came by unicast, and none by the group.
+    Silent,
+    /// It lost more by the group than by unicast: shares of datagrams when it was given up.
+    Loses {
+        /// By the group.
+        group: f64,
+        /// By unicast.
+        unicast: f64,
+    },
 }
 
 impl Streams {
@@ -162,6 +178,7 @@ impl Streams {
                 reception: Reception::Unknown,
                 unicast_until: now,
                 since: now,
+                silent: false,
             };
             self.leases.insert(key, lease);
             if let Some(stream) = self.streams.get_mut(&id)
@@ -242,6 +259,7 @@ impl Streams {
             let changed = lease.at.data != at.data || lease.reception != reception;
             lease.at = at;
             lease.reception = reception;
+            lease.silent &= reception != Reception::Arrives;
             if entry.joined != lease.group.is_some() {
                 let (stream, group) = (Some(stream), lease.group);
                 grants.push(GrantEntry {
@@ -462,6 +480,7 @@ impl Streams {
             };
             if lease.reception == Reception::Silent {
                 lease.unicast_until = now + TRIAL_PAUSE;
+                lease.silent = true;
             }
             let works = self.quality.get(tag).zip(group_number(group));
             let works = works.is_none_or(|(quality, number)| quality.admits(number, now));
@@ -529,7 +548,15 @@ impl Streams {
             group_loss: quality
                 .zip(number)
                 .and_then(|(q, number)| q.group_loss(number)),
-            shuns_group: quality.is_some_and(Quality::shuns),
+            shuns: match reader.via {
+                Via::Group(_) | Via::Both(_) => None,
+                Via::Unicast if stream.readers.len() < 2 => None,
+                Via::Unicast if lease.is_some_and(|lease| lease.silent) => Some(Shuns::Silent),
+                Via::Unicast => {
+                    let losses = quality.zip(number).and_then(|(q, n)| q.shunned(n));
+                    losses.map(|(group, unicast)| Shuns::Loses { group, unicast })
+                }
+            },
         }
     }
 }
@@ -613,6 +640,9 @@ mod tests {
         assert_eq!(path(&streams), ["group", "group"]);
         renew(&mut streams, 2, 1, Reception::Silent, NOW);
         assert_eq!(path(&streams), ["unicast", "unicast"]);
+        let stream = streams.iter().next().unwrap();
+        let shuns: Vec<_> = stream.choices.iter().map(|choice| choice.shuns).collect();
+        assert_eq!(shuns, [None, Some(Shuns::Silent)]);
         // With a third, the deaf one alone stays on unicast.
         reader(&mut streams, 3, 1, NOW, &mut out);
         assert_eq!(path(&streams), ["both", "unicast", "both"]);

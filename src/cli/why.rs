@@ -256,6 +256,8 @@ mod tests {
             schema: String::new(),
             epoch: Epoch(1),
             published: 7,
+            newest: None,
+            depth: 8,
             readers: Vec::new(),
             note: String::new(),
         }
@@ -299,6 +301,7 @@ mod tests {
             contract: Contract::default(),
             bound: true,
             refused: None,
+            books: None,
         });
         let orphaned = item(WriterState::Orphaned);
         let mut unread = item(WriterState::Live);
@@ -310,6 +313,7 @@ mod tests {
             contract: Contract::default(),
             bound: false,
             refused: Some("field `latitude` is f32, f64 expected".to_owned()),
+            books: None,
         });
         let up = [host("up")];
 

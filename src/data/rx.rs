@@ -8,13 +8,16 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use anyhow::Context;
-use ddx_catalog::delivery::{Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent};
+use ddx_catalog::delivery::{
+    Passed, Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent,
+};
 use ddx_store::{Origin, RawWriter};
 use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::Opener;
 use ddx_wire::{ClockOffset, Contract, Epoch, Seq, StreamId, Tag, Time};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use super::board::{self, Board, Inward, Mirrored};
 use super::{Traffic, count, mailbox};
 use crate::net::Channel;
 
@@ -92,21 +95,33 @@ struct State {
     inbound: Inbound,
     notices: mailbox::Sender<Notice>,
     told: Time,
+    board: Arc<Board>,
+    shown: Time,
     spin: bool,
 }
 
 /// Where samples go.
 struct Inbound {
     mirrors: HashMap<MirrorId, Mirror>,
-    streams: HashMap<(Tag, StreamId), MirrorId>,
+    streams: HashMap<(Tag, StreamId), Stream>,
     /// What is known of the senders' clocks, and since when.
     clocks: HashMap<Tag, (ClockOffset, Time)>,
     traffic: Arc<Traffic>,
 }
 
+/// What is expected of a sender.
+struct Stream {
+    mirror: MirrorId,
+    counts: Mirrored,
+}
+
 struct Mirror {
     writer: RawWriter,
     newest: (Epoch, Seq),
+    /// Who sent that: another stream of the same life goes on where it ended.
+    from: Option<Tag>,
+    /// Samples of the epoch that the source did not send: what a reader here cannot know otherwise.
+    passed: Passed,
 }
 
 impl Rx {
@@ -116,7 +131,7 @@ impl Rx {
         group: UdpSocket,
         config: ReceiverConfig,
         notices: mailbox::Sender<Notice>,
-        traffic: Arc<Traffic>,
+        (traffic, board): (Arc<Traffic>, Arc<Board>),
         spin: bool,
     ) -> anyhow::Result<Self> {
         let (orders, inbox) =
@@ -134,6 +149,8 @@ impl Rx {
             },
             notices,
             told: now,
+            board,
+            shown: now,
             spin,
         };
         let thread = thread::Builder::new()
@@ -254,12 +271,16 @@ impl State {
                     Mirror {
                         writer,
                         newest: Default::default(),
+                        from: None,
+                        passed: Passed::default(),
                     },
                 );
             }
             Order::DropMirror(mirror) => {
                 self.inbound.mirrors.remove(&mirror);
-                self.inbound.streams.retain(|_key, id| *id != mirror);
+                self.inbound
+                    .streams
+                    .retain(|_key, stream| stream.mirror != mirror);
             }
             Order::RoundTrip { tag, time } => self.receiver.round_trip(tag, time),
             Order::Expect {
@@ -269,8 +290,16 @@ impl State {
                 mirror,
             } => {
                 let now = ddx_store::now();
-                self.receiver.listen(tag, stream, &contract, now);
-                self.inbound.streams.insert((tag, stream), mirror);
+                let held = self.inbound.mirrors.get(&mirror);
+                let held = held.filter(|held| held.from == Some(tag));
+                let after = held.map(|held| held.newest);
+                self.receiver.resume(tag, stream, &contract, after, now);
+                let fresh = Stream {
+                    mirror,
+                    counts: Mirrored::default(),
+                };
+                let known = self.inbound.streams.entry((tag, stream));
+                known.or_insert(fresh).mirror = mirror;
                 self.inbound.take(&mut self.receiver, now);
             }
             Order::Forget { tag, stream } => {
@@ -318,6 +347,10 @@ impl State {
             // A full queue costs one acknowledgement, which the next renewal makes good.
             self.notices.send(notice).ok();
         }
+        if now.since(self.shown) >= board::PERIOD {
+            self.shown = now;
+            self.board.put_inward(self.books(now));
+        }
         if now.since(self.told) >= SLEEP_MAX {
             self.told = now;
             self.notices
@@ -327,54 +360,107 @@ impl State {
     }
 }
 
+impl State {
+    fn books(&self, now: Time) -> Inward {
+        let known = &self.inbound.streams;
+        let streams = self.receiver.all_books().map(|((tag, stream), books)| {
+            let counts = known.get(&(tag, stream)).map(|stream| stream.counts);
+            (tag, stream, books, counts.unwrap_or_default())
+        });
+        Inward {
+            at: now,
+            streams: streams.collect(),
+        }
+    }
+}
+
 impl Inbound {
     /// Writes to the mirrors what the receiver has whole.
     fn take(&mut self, receiver: &mut Receiver, now: Time) {
         while let Some(sample) = receiver.poll_sample() {
-            let mirror = self
-                .streams
-                .get(&(sample.tag, sample.stream))
-                .and_then(|id| self.mirrors.get_mut(id));
-            if let Some(mirror) = mirror {
-                // Nothing may have renewed it since the last stream ended.
-                let clock = self.clocks.get(&sample.tag);
-                let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
-                mirror.take(&sample, clock.as_ref(), now, &self.traffic);
+            let Some(stream) = self.streams.get_mut(&(sample.tag, sample.stream)) else {
+                continue;
+            };
+            let Some(mirror) = self.mirrors.get_mut(&stream.mirror) else {
+                stream.counts.refused += 1;
+                continue;
+            };
+            // Nothing may have renewed it since the last stream ended.
+            let clock = self.clocks.get(&sample.tag);
+            let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
+            match mirror.take(&sample, clock.as_ref(), now) {
+                Fate::Written => {
+                    stream.counts.written += 1;
+                    stream.counts.bytes += sample.payload.len() as u64;
+                }
+                Fate::Stale => {
+                    stream.counts.stale += 1;
+                    count(&self.traffic.stale_samples, 1);
+                }
+                Fate::Refused => {
+                    stream.counts.refused += 1;
+                    count(&self.traffic.refused_samples, 1);
+                }
             }
         }
     }
 }
 
 impl Mirror {
-    fn take(
-        &mut self,
-        sample: &Received<'_>,
-        clock: Option<&ClockOffset>,
-        now: Time,
-        traffic: &Traffic,
-    ) {
+    fn take(&mut self, sample: &Received<'_>, clock: Option<&ClockOffset>, now: Time) -> Fate {
         let meta = &sample.meta;
         if (meta.epoch, meta.seq) <= self.newest {
-            count(&traffic.stale_samples, 1);
-            return;
+            return Fate::Stale;
         }
+        let passed = self.passed_until(sample);
         // Without a measured clock the owner's instants say nothing here: the age is unknown, and says so.
         let local = |at: Time| clock.map_or(now, |clock| clock.to_local(at).min(now));
         let origin = Origin {
             epoch: meta.epoch,
             seq: meta.seq,
-            filtered: meta.filtered,
+            filtered: passed.filtered,
+            overwritten: passed.overwritten,
             capture: local(meta.capture),
             publish: local(meta.publish),
             receive: Some(now),
             bound_ns: Some(clock.map_or(u64::MAX, |clock| clock.bound_ns)),
         };
         match self.writer.write_with(sample.payload, &origin) {
-            Ok(_position) => self.newest = (meta.epoch, meta.seq),
+            Ok(_position) => {
+                self.newest = (meta.epoch, meta.seq);
+                (self.from, self.passed) = (Some(sample.tag), passed);
+                Fate::Written
+            }
             Err(error) => {
                 tracing::debug!(%error, "sample not mirrored");
-                count(&traffic.refused_samples, 1);
+                // What lay before it counts all the same.
+                self.passed = passed;
+                Fate::Refused
             }
         }
     }
+
+    /// Samples of the epoch that the source did not send, up to this one.
+    fn passed_until(&self, sample: &Received<'_>) -> Passed {
+        let (meta, more) = (&sample.meta, sample.passed);
+        match self.newest {
+            // Nobody here asked for what was before.
+            (Epoch(0), _) => Passed {
+                filtered: meta.seq.0.saturating_sub(1),
+                overwritten: 0,
+            },
+            (epoch, _) if epoch == meta.epoch => Passed {
+                filtered: self.passed.filtered.saturating_add(more.filtered),
+                overwritten: self.passed.overwritten.saturating_add(more.overwritten),
+            },
+            _ => more,
+        }
+    }
+}
+
+/// What became of a sample at its mirror.
+enum Fate {
+    Written,
+    Stale,
+    Refused,
 }

@@ -17,6 +17,7 @@ use ddx_wire::sample::SampleMeta;
 use ddx_wire::seal::Sealer;
 use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
 
+use super::board::{self, Board, Outward};
 use super::{Traffic, count, mailbox};
 use crate::net::Channel;
 
@@ -72,6 +73,8 @@ struct State {
     streams: HashMap<StreamId, Stream>,
     by_key: HashMap<WaitKey, StreamId>,
     traffic: Arc<Traffic>,
+    board: Arc<Board>,
+    shown: Time,
     datagrams: Vec<u8>,
     spin: bool,
 }
@@ -97,7 +100,7 @@ impl Tx {
         channel: Channel,
         store: &Store,
         sealer: Sealer,
-        traffic: Arc<Traffic>,
+        (traffic, board): (Arc<Traffic>, Arc<Board>),
         spin: bool,
     ) -> anyhow::Result<Self> {
         let (orders, inbox) =
@@ -115,6 +118,8 @@ impl Tx {
             streams: HashMap::new(),
             by_key: HashMap::new(),
             traffic,
+            board,
+            shown: ddx_store::now(),
             datagrams: Vec::new(),
             spin,
         };
@@ -163,6 +168,7 @@ impl State {
             self.pull_due(now);
             self.sender.handle_timeout(now);
             self.send();
+            self.show(now);
             let timeout = if self.spin {
                 Duration::ZERO
             } else {
@@ -173,6 +179,19 @@ impl State {
                 // Where there are fewer cores than threads that spin, the others get their turn.
                 thread::yield_now();
             }
+        }
+    }
+
+    /// Puts up the books, now and then.
+    fn show(&mut self, now: Time) {
+        if now.since(self.shown) >= board::PERIOD {
+            self.shown = now;
+            self.board.put_outward(Outward {
+                at: now,
+                sources: self.sender.source_books().collect(),
+                sent: self.sender.sent_books().collect(),
+                paths: self.sender.paths().collect(),
+            });
         }
     }
 

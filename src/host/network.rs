@@ -19,6 +19,7 @@ use tokio::net::{UdpSocket, UnixStream};
 use tokio::time::sleep;
 
 use super::Config;
+use crate::data::board::Board;
 use crate::data::mailbox::{self, mailbox};
 use crate::data::rx::{self, MirrorId, Rx};
 use crate::data::tx::{self, Tx};
@@ -62,6 +63,7 @@ pub(super) struct Network {
     notices: mailbox::Receiver<rx::Notice>,
     notified: UnixStream,
     traffic: Arc<Traffic>,
+    board: Arc<Board>,
     control_traffic: Traffic,
     received: ReceiverCounters,
     host: HostName,
@@ -139,6 +141,7 @@ impl Network {
         );
 
         let traffic = Arc::new(Traffic::default());
+        let board = Arc::new(Board::default());
         let (notify, notices) = mailbox(NOTICES).context("making the queue of the control loop")?;
         let tx_store = handle
             .connect()
@@ -149,7 +152,7 @@ impl Network {
             Channel::new(sockets.data.try_clone()?)?.with_outlets(outlets.clone()),
             &tx_store,
             sealer,
-            Arc::clone(&traffic),
+            (Arc::clone(&traffic), Arc::clone(&board)),
             config.spin,
         )?;
         let rx = Rx::start(
@@ -157,7 +160,7 @@ impl Network {
             sockets.group,
             receiver,
             notify,
-            Arc::clone(&traffic),
+            (Arc::clone(&traffic), Arc::clone(&board)),
             config.spin,
         )?;
         Ok(Self {
@@ -184,6 +187,7 @@ impl Network {
             notified: UnixStream::from_std(notices.signal()?)?,
             notices,
             traffic,
+            board,
             control_traffic: Traffic::default(),
             received: ReceiverCounters::default(),
             host: config.host.clone(),
@@ -314,6 +318,11 @@ impl Network {
 
     pub(super) fn traffic(&self) -> [&Traffic; 2] {
         [&self.control_traffic, &self.traffic]
+    }
+
+    /// What the data threads have counted.
+    pub(super) fn board(&self) -> &Board {
+        &self.board
     }
 
     pub(super) fn received(&self) -> &ReceiverCounters {

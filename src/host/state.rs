@@ -4,7 +4,8 @@
 //! |---|---|
 //! | `@/self` | this host: name, id, domain, whether there is a key, addresses, ports, what the system granted |
 //! | `@/hosts` | the other hosts: name, id, state, address in use, round trip, loss, all paths, since when; when multicast last passed from and to each |
-//! | `@/routes` | streams out and in: item, peers, path, group, rate |
+//! | `@/routes` | streams out and in: item, peers, path, group, contract; for each peer which way, since when, and why |
+//! | `@/books` | what became of each sample, by stream and hop |
 //! | `@/clock` | offset and bound of each other host's clock, nanoseconds |
 //! | `@/counters` | name to count: datagrams, bytes, drops by reason |
 
@@ -14,7 +15,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use anyhow::Context as _;
 use ddx_catalog::delivery::{Route, Via};
-use ddx_catalog::{HostState, HostStatus, PathStatus, StreamIn, StreamOut};
+use ddx_catalog::{Choice, HostState, HostStatus, PathStatus, Shuns, StreamIn, StreamOut};
 use ddx_store::server::Handle;
 use ddx_store::{RawWriter, Schema, Store, WriterOptions};
 use ddx_wire::seal::Refused;
@@ -22,6 +23,7 @@ use ddx_wire::{ItemName, Tag};
 use rustix::process::{Resource, getrlimit};
 use serde_json::{Map, Value, json};
 
+use super::books::books;
 use super::network::Network;
 use super::{Config, Ready};
 use crate::data::Traffic;
@@ -94,6 +96,13 @@ impl Publisher {
         self.write(
             "@/routes",
             &network.map_or_else(|| json!([]), |network| routes(network, &hosts)),
+        );
+        self.write(
+            "@/books",
+            &network.map_or_else(
+                || json!({ "rows": [], "left_off": 0 }),
+                |network| books(network, &hosts),
+            ),
         );
         self.write("@/counters", &network.map_or_else(|| json!({}), counters));
         let notes = network
@@ -210,6 +219,7 @@ fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
             "path": path,
             "group": group,
             "contract": stream.route.contract.to_string(),
+            "ways": ways_out(&stream, hosts),
         })
     });
     let into = network.catalog().streams_in().into_iter().map(|stream| {
@@ -221,9 +231,50 @@ fn routes(network: &Network, hosts: &[HostStatus]) -> Value {
             "path": stream.stream.map(|_granted| path_in(&stream)),
             "group": stream.group,
             "contract": stream.contract.to_string(),
+            "ways": stream.since.map(|since| json!([{
+                "peer": stream.tag.map(|tag| name_of(tag, hosts)),
+                "via": path_in(&stream),
+                "since": since.0,
+                "left_group": stream.left_group,
+            }])),
         })
     });
     out.chain(into).collect()
+}
+
+/// Which way each reading host is served, since when, and why not by the group where that was tried.
+fn ways_out(stream: &StreamOut, hosts: &[HostStatus]) -> Vec<Value> {
+    let readers = stream.route.readers.iter().zip(&stream.choices);
+    let way = readers.map(|(reader, choice)| {
+        json!({
+            "peer": name_of(reader.tag, hosts),
+            "via": match reader.via {
+                Via::Unicast => "unicast",
+                Via::Group(_) => "multicast",
+                Via::Both(_) => "both",
+            },
+            "since": choice.since.0,
+            "unicast_loss_percent": percent(choice.unicast_loss),
+            "multicast_loss_percent": choice.group_loss.map(percent),
+            "shuns": shuns(choice),
+        })
+    });
+    way.collect()
+}
+
+fn shuns(choice: &Choice) -> Option<Value> {
+    Some(match choice.shuns? {
+        Shuns::Silent => json!({ "why": "silent" }),
+        Shuns::Loses { group, unicast } => json!({
+            "why": "loses",
+            "multicast_loss_percent": percent(group),
+            "unicast_loss_percent": percent(unicast),
+        }),
+    })
+}
+
+fn percent(share: f64) -> f64 {
+    (share * 1000.0).round() / 10.0
 }
 
 /// One line for each item that travels: by which path, to or from whom.
@@ -264,24 +315,18 @@ fn path(route: &Route) -> (&'static str, Option<SocketAddr>) {
     (path, group)
 }
 
-/// To whom a stream goes by which way, and why not by multicast where that was tried.
+/// To whom a stream goes by which way.
 fn ways(stream: &StreamOut, hosts: &[HostStatus]) -> String {
     let mut ways: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    for (reader, choice) in stream.route.readers.iter().zip(&stream.choices) {
+    for reader in &stream.route.readers {
         let way = match reader.via {
             Via::Unicast => "unicast".to_owned(),
             Via::Group(group) => format!("multicast {group}"),
             Via::Both(group) => format!("both unicast and multicast {group}"),
         };
-        let mut name = name_of(reader.tag, hosts);
-        if choice.shuns_group && reader.via == Via::Unicast {
-            name.push_str(&format!(
-                " (multicast loses too much; unicast loses {:.1} %, since {:.0} s)",
-                choice.unicast_loss * 100.0,
-                ddx_store::now().since(choice.since).as_secs_f64()
-            ));
-        }
-        ways.entry(way).or_default().push(name);
+        ways.entry(way)
+            .or_default()
+            .push(name_of(reader.tag, hosts));
     }
     let ways: Vec<_> = ways
         .into_iter()
@@ -307,7 +352,7 @@ fn peers(stream: &StreamOut, hosts: &[HostStatus]) -> Vec<String> {
         .collect()
 }
 
-fn name_of(tag: Tag, hosts: &[HostStatus]) -> String {
+pub(super) fn name_of(tag: Tag, hosts: &[HostStatus]) -> String {
     hosts
         .iter()
         .find(|host| host.tag == tag)

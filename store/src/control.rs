@@ -5,14 +5,15 @@
 //! File descriptors ride beside a message: a segment is always two, `data` then `ctl`.
 
 use ddx_wire::codec::{self, CodecError};
-use ddx_wire::{Contract, Epoch, HostName, ItemName, SchemaHash, Time, WriterState};
+use ddx_wire::{Contract, Epoch, HostName, ItemName, SchemaHash, Seq, Time, WriterState};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::quota::Limit;
+use crate::segment::ReaderBooks;
 
 /// Version of these messages; another one is refused at the greeting.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Longest message in either direction, bytes.
 pub const MESSAGE_MAX_BYTES: usize = 64 * 1024;
@@ -310,10 +311,27 @@ pub struct Description {
     pub epoch: Epoch,
     /// Samples published in the present segment.
     pub published: u64,
+    /// The newest of them; none before the first, and while its writer overtakes the look.
+    pub newest: Option<Newest>,
+    /// Samples that the present segment's ring holds.
+    pub depth: u32,
     /// Who reads it on this host.
     pub readers: Vec<ReaderEntry>,
     /// What the daemon says about its way here; empty for an item of this host.
     pub note: String,
+}
+
+/// The newest sample of a segment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Newest {
+    /// Its position, counted from 1: as many samples were stored.
+    pub pos: u64,
+    /// Tenure of the writer that made it.
+    pub epoch: Epoch,
+    /// Its number within the epoch, by its writer.
+    pub seq: Seq,
+    /// Bytes of its payload.
+    pub bytes: u64,
 }
 
 /// One reader of an item.
@@ -329,6 +347,8 @@ pub struct ReaderEntry {
     pub bound: bool,
     /// Why it was refused, if it was.
     pub refused: Option<String>,
+    /// What it has read; none without a place, and while it is just reading.
+    pub books: Option<ReaderBooks>,
 }
 
 impl Binding {

@@ -10,7 +10,8 @@
 //! ctl    line 0   state                                              superseded, orphaned, removed
 //!        line 1   waiting                                            a bit per cell
 //!        line 2   open                                               a bit per cell
-//!        line 3.. cells x { pins << 32 | bell, pin x 15 }            a line each
+//!        line 3.. cells x { pins << 32 | bell, pin x 15              a line
+//!                           books }                                  a line, of which only the daemon reads
 //! ```
 //!
 //! All words are u64, little-endian. A header that another process wrote is copied out once and judged as a value;
@@ -36,7 +37,7 @@ pub const LINE_WORDS: usize = 16;
 /// First word of every data segment: `ddxring` and a zero.
 pub const MAGIC: u64 = u64::from_le_bytes(*b"ddxring\0");
 /// Version of this layout; any other is refused.
-pub const VERSION: u64 = 2;
+pub const VERSION: u64 = 3;
 
 /// Largest payload, bytes: keeps sums of a slot's size far from overflow and a typing error from mapping the world.
 pub const MAX_CAPACITY: u32 = 1 << 30;
@@ -68,6 +69,8 @@ pub const WAITING: usize = LINE_WORDS;
 /// Word of the mask of cells in use, in `ctl`.
 pub const OPEN: usize = 2 * LINE_WORDS;
 const FIRST_CELL: usize = 3 * LINE_WORDS;
+/// Words of a cell: what the writer scans, and apart from it what the reader changes with each sample.
+const CELL_WORDS: usize = 2 * LINE_WORDS;
 
 /// What a writer asks of its segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -148,7 +151,7 @@ impl Spec {
         let data_len = first_slot.saturating_add(slots.saturating_mul(stride));
         let ctl_len = wide(FIRST_CELL)
             .saturating_mul(wide(WORD))
-            .saturating_add(u64::from(self.cells).saturating_mul(line));
+            .saturating_add(u64::from(self.cells).saturating_mul(wide(CELL_WORDS * WORD)));
         let too_large = |value: u64| LayoutError::Limit {
             what: "segment size (bytes)",
             value,
@@ -298,7 +301,13 @@ impl Shape {
     /// Word of the bell of `cell`, which is below the number of cells.
     #[inline]
     pub fn bell_word(&self, cell: u32) -> usize {
-        FIRST_CELL + clamp(cell) * LINE_WORDS
+        FIRST_CELL + clamp(cell) * CELL_WORDS
+    }
+
+    /// First word of the books of `cell`, which is below the number of cells.
+    #[inline]
+    pub fn books_word(&self, cell: u32) -> usize {
+        self.bell_word(cell) + LINE_WORDS
     }
 
     /// Word of one pin of `cell`; `pin` is below [`MAX_PINS`].
@@ -384,8 +393,9 @@ mod tests {
                 );
             }
         }
-        assert!((shape.pin_word(3, MAX_PINS - 1) + 1) * WORD <= shape.ctl_len());
-        assert_eq!(shape.pin_word(0, MAX_PINS - 1) + 1, shape.bell_word(1));
+        assert_eq!((shape.books_word(3) + LINE_WORDS) * WORD, shape.ctl_len());
+        assert_eq!(shape.pin_word(0, MAX_PINS - 1) + 1, shape.books_word(0));
+        assert_eq!(shape.books_word(0) + LINE_WORDS, shape.bell_word(1));
     }
 
     #[test]

@@ -89,12 +89,12 @@ mod waitset;
 mod writer;
 
 pub use clock::now;
-pub use control::{Description, ItemEntry, ReaderEntry, Refusal, SCHEMA_MAX_BYTES};
+pub use control::{Description, ItemEntry, Newest, ReaderEntry, Refusal, SCHEMA_MAX_BYTES};
 pub use error::Error;
 pub use quota::{Limit, Quotas};
 pub use reader::{From, Guard, RawGuard, RawReader, Reader, ReaderOptions};
 pub use sample::{After, Age, Cursor, Meta, Missed, Sample};
-pub use segment::Origin;
+pub use segment::{Origin, ReaderBooks};
 pub use store::{Options, Store};
 pub use wait::{Wait, wait_any};
 pub use waitset::{WaitKey, WaitSet, Waker};

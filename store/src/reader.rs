@@ -17,7 +17,7 @@ use crate::notify::Bell;
 use crate::recovery::Registration;
 use crate::sample::{After, Cursor, Meta, Missed, Sample};
 use crate::schema::Schema;
-use crate::segment::{Copier, Pin, PinError, Seat, SegmentFds, SegmentReader, Stamp};
+use crate::segment::{Copier, Pin, PinError, ReaderBooks, Seat, SegmentFds, SegmentReader, Stamp};
 use crate::store::unexpected;
 use crate::wait::{Condition, Patience, Readiness, Wait, sleep};
 use crate::writer::segment_error;
@@ -67,6 +67,8 @@ pub struct RawReader {
     refused: Option<Refusal>,
     seen: Cursor,
     missed: Missed,
+    /// What `next` read, in all; shown to the daemon in each seat.
+    books: ReaderBooks,
     from: From,
     interval: Duration,
     due: Time,
@@ -264,6 +266,7 @@ impl RawReader {
             refused: None,
             seen: Cursor::default(),
             missed: Missed::default(),
+            books: ReaderBooks::default(),
             from: options.from,
             interval: Duration::from_nanos(contract.interval_ns()),
             due: Time(0),
@@ -484,19 +487,46 @@ impl RawReader {
             self.seen.pos = meta.pos;
             return false;
         }
-        if self.seen.seq != Seq(0) {
+        if self.seen.seq == Seq(0) {
+            self.books.expected = 1;
+        } else {
             let mut missed = self.seen.missed_until(meta);
             if !self.interval.is_zero() {
                 // What was passed over on purpose was still to be had.
                 missed.filtered += std::mem::take(&mut missed.overwritten);
             }
             self.missed.add(missed);
+            let before = match self.seen.epoch == meta.epoch {
+                true => self.seen.seq.0,
+                false => 0,
+            };
+            self.books.expected = self.books.expected.saturating_add(meta.seq.0 - before);
         }
         self.seen = meta.cursor();
+        self.books.delivered += 1;
+        self.books.pos = meta.pos;
+        self.show_books();
         if !self.interval.is_zero() {
             self.due = clock::now() + self.interval;
         }
         true
+    }
+
+    #[inline]
+    fn show_books(&self) {
+        let Missed {
+            overwritten,
+            filtered,
+            lost,
+        } = self.missed;
+        if let Some(bound) = &self.bound {
+            bound.segment.set_books(&ReaderBooks {
+                overwritten,
+                filtered,
+                lost,
+                ..self.books
+            });
+        }
     }
 
     fn guard(&self, pin: Pin, meta: Meta) -> RawGuard {
@@ -595,6 +625,9 @@ impl RawReader {
             passed: 0,
             bit: binding.bit,
         });
+        // Positions are those of the new segment from now on.
+        self.books.pos = 0;
+        self.show_books();
         Ok(())
     }
 

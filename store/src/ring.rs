@@ -27,8 +27,10 @@ use crate::layout::{self, LINE_WORDS, MAX_PINS, Shape};
 use crate::notify::Bell;
 use crate::sync::{Ordering, Site, fence, order};
 
-/// Words beside a slot's position: length, epoch, sequence, filtered, capture, publish, receive, bound.
-pub const STAMP_WORDS: usize = 8;
+/// Words beside a slot's position: length, epoch, sequence, filtered, capture, publish, receive, bound, overwritten.
+pub const STAMP_WORDS: usize = 9;
+/// Words of a reader's books in its cell; all zeros before it has read anything.
+pub const BOOK_WORDS: usize = 7;
 
 /// Retired slots that are gathered before pins are scanned for them, where fresh slots allow. A scan touches a line
 /// or two for each open cell; eight writes share it, and the slots in use still fit the cache.
@@ -392,6 +394,12 @@ impl<W: Words> RingReader<W> {
             .store(self.shape.bell_word(self.cell), seat, Ordering::Relaxed);
     }
 
+    /// Shows the daemon what this reader has read.
+    #[inline]
+    pub fn set_books(&self, books: &[u64; BOOK_WORDS]) {
+        self.ctl.store_run(self.shape.books_word(self.cell), books);
+    }
+
     /// Gives the cell up.
     pub fn leave(&self) {
         clear_cell(&self.ctl, &self.shape, self.cell);
@@ -512,8 +520,18 @@ pub fn clear_cell<W: Words>(ctl: &W, shape: &Shape, cell: u32) {
             set_pin(ctl, shape, cell, pin, 0);
         }
     }
+    let books = shape.books_word(cell);
+    // The last of them is zero only while all are.
+    if ctl.load(books + BOOK_WORDS - 1, Ordering::Relaxed) != 0 {
+        ctl.store_run(books, &[0; BOOK_WORDS]);
+    }
     // Release: pairs with the Acquire in `RingWriter::scan`, which does not look at the pins of a closed cell.
     ctl.fetch_and(layout::OPEN, !(1 << cell), order(Site::PinStore));
+}
+
+/// What the reader in a cell says that it has read; words of another process, perhaps of two moments.
+pub fn cell_books<W: Words>(ctl: &W, shape: &Shape, cell: u32) -> [u64; BOOK_WORDS] {
+    ctl.load_run(shape.books_word(cell))
 }
 
 /// Pins of a cell by its word, which anybody may have written.
@@ -529,5 +547,6 @@ fn set_pin<W: Words>(ctl: &W, shape: &Shape, cell: u32, pin: u32, value: u64) {
 const _: () = assert!(STAMP_WORDS < LINE_WORDS, "a slot's header is one line");
 const _: () = assert!(
     MAX_PINS as usize + 1 == LINE_WORDS,
-    "a cell is one line: its bell and its pins"
+    "the first line of a cell: its bell and its pins"
 );
+const _: () = assert!(BOOK_WORDS <= LINE_WORDS, "the second line of a cell");

@@ -27,8 +27,11 @@ pub struct Meta {
     pub epoch: Epoch,
     /// Its number within the epoch, from 1.
     pub seq: Seq,
-    /// Samples of the epoch so far that were left out on their way to this host, because nobody asked for them.
+    /// Samples of the epoch so far that were left out on their way to this host, because nobody here asked for them, or
+    /// because the link is slower than the writer.
     pub filtered: u64,
+    /// Samples of the epoch so far that gave way to newer ones in their writer's ring before they could be sent.
+    pub overwritten: u64,
     /// When its content was true.
     pub capture: Time,
     /// When its writer published it.
@@ -59,6 +62,8 @@ pub struct Cursor {
     pub seq: Seq,
     /// Samples of the epoch that were filtered up to it.
     pub filtered: u64,
+    /// Samples of the epoch that were overwritten at their host up to it.
+    pub overwritten: u64,
     /// Epoch of the segment that it was read from.
     pub segment: Epoch,
     /// Its position there.
@@ -66,11 +71,16 @@ pub struct Cursor {
 }
 
 /// Samples that a reader did not get, by cause.
+///
+/// Of an item of another host the causes are told apart exactly where each sample is wanted
+/// ([`Delivery::Every`](ddx_wire::Delivery::Every)): `overwritten` is what the writer's ring or the one of this host's mirror
+/// let go, `filtered` what the contract's greatest age kept back, and `lost` what the network lost for good. Where the newest
+/// is enough, what the source leaves out for whatever reason is `filtered`, and what came too late to be newer is `lost`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Missed {
-    /// Were in the ring, and gave way to newer ones before they were read.
+    /// Were in a ring, and gave way to newer ones: here before they were read, or at their host before they were sent.
     pub overwritten: u64,
-    /// Were left out because the rate that was asked for is lower, at the source or here.
+    /// Were left out because of what was asked for, at the source or here, or because the link is slower than the writer.
     pub filtered: u64,
     /// Never reached this host.
     pub lost: u64,
@@ -95,6 +105,7 @@ impl Meta {
             epoch: origin.epoch,
             seq: origin.seq,
             filtered: origin.filtered,
+            overwritten: origin.overwritten,
             capture: origin.capture,
             publish: origin.publish,
             receive: origin.receive,
@@ -123,6 +134,7 @@ impl Meta {
             epoch: self.epoch,
             seq: self.seq,
             filtered: self.filtered,
+            overwritten: self.overwritten,
             segment: self.segment,
             pos: self.pos,
         }
@@ -153,13 +165,14 @@ impl Cursor {
     pub(crate) fn missed_until(&self, meta: &Meta) -> Missed {
         let same_epoch = self.epoch == meta.epoch;
         // An epoch begins at 1, with nothing filtered: of the end of the former one nobody can tell.
-        let (seq, filtered) = if same_epoch {
-            (self.seq.0, self.filtered)
+        let (seq, filtered, gone) = if same_epoch {
+            (self.seq.0, self.filtered, self.overwritten)
         } else {
-            (0, 0)
+            (0, 0, 0)
         };
         let gap = meta.seq.0.saturating_sub(seq).saturating_sub(1);
         let filtered = meta.filtered.saturating_sub(filtered).min(gap);
+        let gone = meta.overwritten.saturating_sub(gone);
         let in_segment = if self.segment == meta.segment {
             self.pos
         } else {
@@ -169,7 +182,7 @@ impl Cursor {
         let overwritten = match meta.receive {
             // Whatever this host's writer published was in the ring.
             None => gap - filtered,
-            Some(_) => passed.min(gap - filtered),
+            Some(_) => passed.saturating_add(gone).min(gap - filtered),
         };
         Missed {
             overwritten,
@@ -209,6 +222,7 @@ mod tests {
             epoch: Epoch(5),
             seq: Seq(seq),
             filtered,
+            overwritten: 0,
             capture: Time(100),
             publish: Time(110),
             receive,
@@ -242,14 +256,18 @@ mod tests {
     #[test]
     fn a_mirror_tells_overwritten_filtered_and_lost_apart() {
         let before = meta(3, 10, 4, Some(Time(1))).cursor();
-        // 19 numbers between: 7 filtered at the source, 2 passed through the ring, the others never came.
-        let missed = before.missed_until(&meta(6, 30, 11, Some(Time(2))));
+        // 19 numbers between: 7 filtered at the source, 3 overwritten there, 2 passed through the ring here, the others
+        // never came.
+        let missed = before.missed_until(&Meta {
+            overwritten: 3,
+            ..meta(6, 30, 11, Some(Time(2)))
+        });
         assert_eq!(
             missed,
             Missed {
-                overwritten: 2,
+                overwritten: 5,
                 filtered: 7,
-                lost: 10
+                lost: 7
             }
         );
     }

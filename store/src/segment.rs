@@ -10,6 +10,7 @@
 //! handle remembers the process that made it: its mappings are absent after a fork, so all calls then report that
 //! instead of touching memory ([`crate::shm::fork`]).
 
+mod books;
 mod control;
 mod reader;
 mod writer;
@@ -21,6 +22,7 @@ use std::sync::Arc;
 use ddx_wire::{Epoch, Seq, Time};
 use thiserror::Error;
 
+pub use self::books::ReaderBooks;
 pub use self::control::SegmentControl;
 pub use self::reader::{Copier, Pin, PinError, SegmentReader};
 pub use self::writer::{LoanError, SegmentWriter, Slot};
@@ -54,6 +56,8 @@ pub struct Origin {
     pub seq: Seq,
     /// Samples of the epoch so far that were filtered on their way here.
     pub filtered: u64,
+    /// Samples of the epoch so far that gave way to newer ones before they left their host.
+    pub overwritten: u64,
     /// When its content was true.
     pub capture: Time,
     /// When its writer published it.
@@ -141,6 +145,7 @@ impl Origin {
             self.receive.map_or(0, |time| time.0),
             // One up, so that 0 is "exact"; the largest stays "unknown".
             self.bound_ns.map_or(0, |bound| bound.saturating_add(1)),
+            self.overwritten,
         ]
     }
 }
@@ -148,11 +153,22 @@ impl Origin {
 impl Stamp {
     #[inline]
     fn from_words(pos: u64, len: usize, words: &[u64; STAMP_WORDS]) -> Self {
-        let [_, epoch, seq, filtered, capture, publish, receive, bound] = *words;
+        let [
+            _,
+            epoch,
+            seq,
+            filtered,
+            capture,
+            publish,
+            receive,
+            bound,
+            overwritten,
+        ] = *words;
         let origin = Origin {
             epoch: Epoch(epoch),
             seq: Seq(seq),
             filtered,
+            overwritten,
             capture: Time(capture),
             publish: Time(publish),
             receive: (receive != 0).then_some(Time(receive)),
@@ -198,6 +214,7 @@ mod tests {
             epoch: Epoch(1 << 40),
             seq: Seq(9),
             filtered: 3,
+            overwritten: 2,
             capture: Time(100),
             publish: Time(200),
             receive: None,

@@ -331,6 +331,7 @@ impl RawWriter {
             epoch: self.segment.epoch(),
             seq: self.seq,
             filtered: 0,
+            overwritten: 0,
             capture,
             publish,
             receive: None,

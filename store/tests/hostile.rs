@@ -19,7 +19,7 @@ use std::os::fd::{AsFd, OwnedFd};
 use std::path::Path;
 use std::time::Duration;
 
-use ddx_store::control::{Binding, Notice, Purpose, Reply, Request, ToClient, ToDaemon};
+use ddx_store::control::{self, Binding, Notice, Purpose, Reply, Request, ToClient, ToDaemon};
 use ddx_store::{Error, Quotas, Refusal, Schema, Store, WriterOptions};
 use rig::{Daemon, LONG, NONE};
 use rustix::net::{
@@ -52,7 +52,7 @@ impl Talker {
         let reply = talker
             .ask(
                 Request::Hello {
-                    version: 1,
+                    version: control::VERSION,
                     program,
                 },
                 &[],

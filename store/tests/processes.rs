@@ -478,6 +478,7 @@ fn interest_in_a_foreign_name_is_told_and_its_mirror_is_read() {
         epoch: Epoch(77),
         seq: Seq(9),
         filtered: 8,
+        overwritten: 0,
         capture: Time(1),
         publish: Time(2),
         receive: Some(Time(3)),

@@ -1,9 +1,10 @@
-//! What became of each sample of one stream: the receiver's part of the books.
+//! What became of each sample of one stream: at its source, on each way out, and at its receiver.
 
 use ddx_wire::sample::SampleMeta;
 use ddx_wire::{Epoch, Seq};
 
-use super::key;
+use super::order::Why;
+use super::{Passed, key};
 
 /// Counts of one stream. `expected` is the sum of all from `delivered` to `filtered`; the rest tell of copies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -32,6 +33,47 @@ pub struct Books {
     pub old_epoch: u64,
 }
 
+/// What became of the samples of one stream at their source, before any way. `expected` is the sum of all others but
+/// `bytes`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SourceBooks {
+    /// Samples from the first one that was offered to the newest, over all epochs, by their numbers.
+    pub expected: u64,
+    /// Offered to every way of the stream.
+    pub delivered: u64,
+    /// Left out because the contract asks for fewer.
+    pub rate_limited: u64,
+    /// Gave way to newer ones in the writer's ring before they were read.
+    pub overwritten: u64,
+    /// Older than the contract allows.
+    pub expired: u64,
+    /// Over 64 MiB.
+    pub too_large: u64,
+    /// Payload bytes of those that were offered, or refused.
+    pub bytes: u64,
+}
+
+/// What became of the samples of one stream on one way out. `expected` is the sum of all others but `bytes`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SentBooks {
+    /// Samples from the first one that went out to the newest, over all epochs, by their numbers.
+    pub expected: u64,
+    /// Sent; each counted once, however often it was repeated.
+    pub delivered: u64,
+    /// Left out for every way, as the books of the source say in full.
+    pub filtered: u64,
+    /// Left out here, because this way is slower than the stream.
+    pub queue_dropped: u64,
+    /// Where each sample is wanted: gave way to newer ones in the writer's ring before they were sent.
+    pub overwritten: u64,
+    /// Where each sample is wanted: older than the contract allows when their turn came.
+    pub expired: u64,
+    /// Payload bytes of what was sent, repeats included.
+    pub bytes: u64,
+    /// Whether something newer waits in the store until this way has room.
+    pub waiting: bool,
+}
+
 /// What became of a sample that arrived and was not delivered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Failure {
@@ -58,8 +100,9 @@ pub(super) struct Ledger {
     newest: Option<Newest>,
     /// Samples newer than the newest that failed; a repeat may still deliver them. Sorted, at most [`FAILURES`].
     failed: Vec<(Epoch, Seq, Failure)>,
-    /// Samples before the next that the source says are gone.
+    /// Samples before the next that the source says were overwritten, and left out.
     gone: u64,
+    left_out: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -72,6 +115,17 @@ struct Newest {
 }
 
 impl Ledger {
+    /// Goes on after a sample that was delivered by another stream of the item: what lies behind it counts.
+    pub(super) fn resume(&mut self, epoch: Epoch, seq: Seq) {
+        self.newest = Some(Newest {
+            epoch,
+            seq,
+            // A stream counts all before its first sample as left out.
+            filtered: seq.0,
+            settled: u64::MAX,
+        });
+    }
+
     pub(super) fn books(&self) -> Books {
         self.books
     }
@@ -111,7 +165,8 @@ impl Ledger {
     }
 
     /// Accounts for a sample that is [`Standing::Newer`] and is delivered now.
-    pub(super) fn deliver(&mut self, meta: &SampleMeta) {
+    /// Returns what its source did not send of those before it.
+    pub(super) fn deliver(&mut self, meta: &SampleMeta) -> Passed {
         let (skipped, filtered, settled) = match self.newest {
             // What came before the first sample was never asked for, so it cannot be missed.
             None => (0, 0, u64::MAX),
@@ -126,7 +181,8 @@ impl Ledger {
             }
             Some(_) => (meta.seq.0.saturating_sub(1), meta.filtered, 1),
         };
-        let filtered = filtered.min(skipped);
+        let left_out = std::mem::take(&mut self.left_out);
+        let filtered = filtered.saturating_add(left_out).min(skipped);
         // What failed before the first sample lies outside the range that the books are about.
         if self.newest.is_none() {
             self.failed
@@ -138,34 +194,55 @@ impl Ledger {
         books.filtered = books.filtered.saturating_add(filtered);
         let gone = std::mem::take(&mut self.gone).min(skipped - filtered);
         books.overwritten = books.overwritten.saturating_add(gone);
-        books.link_lost = books.link_lost.saturating_add(skipped - filtered - gone);
+        let mut lost = skipped - filtered - gone;
+        books.link_lost = books.link_lost.saturating_add(lost);
+        // What the source told of one by one is accounted for, also if a part of it had come.
+        let is_told = left_out > 0 || gone > 0;
         let mut newest = Newest {
             epoch: meta.epoch,
             seq: meta.seq,
             filtered: meta.filtered,
             settled,
         };
+        if is_told && lost == 0 {
+            // A copy of one of these that comes later changes nothing.
+            let ahead = u32::try_from(skipped)
+                .ok()
+                .and_then(|n| 1_u64.checked_shl(n + 1));
+            newest.settled |= ahead.map_or(u64::MAX, |bit| bit - 1);
+        }
         self.failed.retain(|(epoch, seq, failure)| {
             let passed = (*epoch, *seq) < key(meta);
             if passed && *epoch == meta.epoch {
-                let count = match failure {
-                    Failure::Expired => &mut books.expired,
-                    Failure::OverBudget => &mut books.over_budget,
-                    Failure::Undecodable => &mut books.undecodable,
-                };
-                *count += 1;
-                books.unlose();
+                if lost > 0 || !is_told {
+                    lost = lost.saturating_sub(1);
+                    let count = match failure {
+                        Failure::Expired => &mut books.expired,
+                        Failure::OverBudget => &mut books.over_budget,
+                        Failure::Undecodable => &mut books.undecodable,
+                    };
+                    *count += 1;
+                    books.unlose();
+                }
                 let behind = u32::try_from(meta.seq.0 - seq.0).unwrap_or(u32::MAX);
                 newest.settled |= 1_u64.checked_shl(behind).unwrap_or(0);
             }
             (*epoch, *seq) > key(meta)
         });
         self.newest = Some(newest);
+        Passed {
+            overwritten: gone,
+            filtered,
+        }
     }
 
     /// Notes that so many samples before the next one cannot be had.
-    pub(super) fn gone(&mut self, count: u64) {
-        self.gone = self.gone.saturating_add(count);
+    pub(super) fn gone(&mut self, count: u64, why: Why) {
+        let counted = match why {
+            Why::Overwritten => &mut self.gone,
+            Why::LeftOut => &mut self.left_out,
+        };
+        *counted = counted.saturating_add(count);
     }
 
     /// Counts a further copy of a sample that is here and not delivered yet.
@@ -196,10 +273,41 @@ impl Ledger {
     }
 }
 
+impl SourceBooks {
+    /// Samples that are accounted for.
+    pub fn accounted(&self) -> u64 {
+        sum([
+            self.delivered,
+            self.rate_limited,
+            self.overwritten,
+            self.expired,
+            self.too_large,
+        ])
+    }
+}
+
+impl SentBooks {
+    /// Samples that are accounted for.
+    pub fn accounted(&self) -> u64 {
+        sum([
+            self.delivered,
+            self.filtered,
+            self.queue_dropped,
+            self.overwritten,
+            self.expired,
+        ])
+    }
+}
+
 impl Books {
     /// Tells whether every expected sample is accounted for.
     pub fn balanced(&self) -> bool {
-        let accounted = [
+        self.accounted() == self.expected
+    }
+
+    /// Samples that are accounted for.
+    pub fn accounted(&self) -> u64 {
+        sum([
             self.delivered,
             self.late,
             self.link_lost,
@@ -208,8 +316,7 @@ impl Books {
             self.undecodable,
             self.filtered,
             self.overwritten,
-        ];
-        accounted.into_iter().fold(0, u64::saturating_add) == self.expected
+        ])
     }
 
     /// Takes back a sample that was booked as missing, since its fate is known now.
@@ -223,6 +330,10 @@ impl Books {
             self.expected += 1;
         }
     }
+}
+
+fn sum<const N: usize>(counts: [u64; N]) -> u64 {
+    counts.into_iter().fold(0, u64::saturating_add)
 }
 
 /// Failed samples of a stream remembered until a newer one is delivered.
@@ -324,12 +435,35 @@ mod tests {
     #[test]
     fn what_the_source_let_go_is_not_lost_on_the_link() {
         let mut ledger = after(&[(1, 1, 0)]);
-        ledger.gone(3);
-        ledger.deliver(&meta(1, 6, 0));
-        ledger.gone(9);
-        ledger.deliver(&meta(1, 7, 0));
+        ledger.gone(3, Why::Overwritten);
+        let passed = ledger.deliver(&meta(1, 6, 0));
+        assert_eq!((passed.overwritten, passed.filtered), (3, 0));
+        ledger.gone(9, Why::Overwritten);
+        let passed = ledger.deliver(&meta(1, 7, 0));
+        assert_eq!((passed.overwritten, passed.filtered), (0, 0));
+        ledger.gone(2, Why::LeftOut);
+        ledger.gone(1, Why::Overwritten);
+        let passed = ledger.deliver(&meta(1, 12, 0));
+        assert_eq!((passed.overwritten, passed.filtered), (1, 2));
         let books = ledger.books();
-        assert_eq!((books.overwritten, books.link_lost), (3, 1));
+        let missing = (books.overwritten, books.filtered, books.link_lost);
+        assert_eq!(missing, (4, 2, 2));
+        assert!(books.balanced());
+    }
+
+    #[test]
+    fn a_stream_that_goes_on_for_another_counts_what_lies_between() {
+        let mut ledger = Ledger::default();
+        ledger.resume(Epoch(1), Seq(10));
+        assert_eq!(ledger.judge(&meta(1, 10, 9)), Standing::Again);
+        // Its first sample says that all before were left out, as of a new stream they were.
+        let passed = ledger.deliver(&meta(1, 15, 14));
+        assert_eq!(passed.filtered, 4);
+        let passed = ledger.deliver(&meta(1, 17, 14));
+        assert_eq!(passed.filtered, 0);
+        let books = ledger.books();
+        assert_eq!((books.expected, books.delivered), (7, 2));
+        assert_eq!((books.filtered, books.link_lost), (4, 1));
         assert!(books.balanced());
     }
 

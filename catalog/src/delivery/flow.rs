@@ -6,6 +6,7 @@ use std::time::Duration;
 use ddx_wire::sample::SampleMeta;
 use ddx_wire::{Contract, Delivery, Epoch, Priority, Seq, Time};
 
+use super::books::SentBooks;
 use super::transfer::Transfer;
 use super::{Want, key};
 
@@ -15,6 +16,8 @@ pub(super) struct Flow<P> {
     /// Turns are taken in the order of this: bytes sent, divided by the weight.
     pub(super) turn: u64,
     progress: Progress,
+    /// What became of the samples since the flow was opened.
+    books: SentBooks,
     /// Since when something newer waits in the store.
     pub(super) waits: Option<Time>,
     /// A reader needs the newest sample again.
@@ -50,6 +53,7 @@ impl<P: AsRef<[u8]>> Flow<P> {
             contract,
             turn,
             progress: Progress::default(),
+            books: SentBooks::default(),
             waits: None,
             urgent: false,
             gaps: VecDeque::new(),
@@ -105,25 +109,70 @@ impl<P: AsRef<[u8]>> Flow<P> {
     /// Notes that a sample goes out now, and says how many of its epoch were left out before it: for all paths, as `meta`
     /// says, and here, because the path was too slow.
     pub(super) fn pass(&mut self, meta: &SampleMeta) -> u64 {
-        let here = match self.progress.newest {
-            Some(last) if key(&last) >= key(meta) => return self.filtered(meta),
-            // Of an item whose every sample is wanted none is left out on purpose.
-            Some(_) if self.is_every() => 0,
-            Some(last) => {
-                let (seq, filtered) = if last.epoch == meta.epoch {
-                    (last.seq.0, last.filtered)
-                } else {
-                    self.progress.left_out = 0;
-                    (0, 0)
-                };
-                let gap = meta.seq.0.saturating_sub(seq).saturating_sub(1);
-                gap.saturating_sub(meta.filtered.saturating_sub(filtered))
-            }
-            None => 0,
-        };
-        self.progress.left_out = self.progress.left_out.saturating_add(here);
+        if self.sent() >= Some(key(meta)) {
+            return self.filtered(meta);
+        }
+        let (filtered, here) = self.skip(meta);
+        self.books.filtered += filtered;
+        self.books.delivered += 1;
+        if self.is_every() {
+            // None is left out on purpose: the ring let it go.
+            self.books.overwritten += here;
+        } else {
+            self.books.queue_dropped += here;
+            self.progress.left_out = self.progress.left_out.saturating_add(here);
+        }
         self.progress.newest = Some(*meta);
         self.filtered(meta)
+    }
+
+    /// Passes over a sample that the contract keeps back, of a stream of which each is wanted; false if it was passed before.
+    pub(super) fn leave_out(&mut self, meta: &SampleMeta) -> bool {
+        if self.sent().is_none() || self.sent() >= Some(key(meta)) {
+            return false;
+        }
+        let (filtered, here) = self.skip(meta);
+        self.books.filtered += filtered;
+        self.books.overwritten += here;
+        self.books.expired += 1;
+        self.progress.newest = Some(*meta);
+        true
+    }
+
+    /// How many lie between the last sample and this one: those left out for all paths, and the others.
+    fn skip(&mut self, meta: &SampleMeta) -> (u64, u64) {
+        let (seq, filtered) = match self.progress.newest {
+            Some(last) if last.epoch == meta.epoch => (last.seq.0, last.filtered),
+            Some(_) => {
+                self.progress.left_out = 0;
+                (0, 0)
+            }
+            None => (meta.seq.0.saturating_sub(1), meta.filtered),
+        };
+        let ahead = meta.seq.0.saturating_sub(seq);
+        self.books.expected = self.books.expected.saturating_add(ahead);
+        let gap = ahead.saturating_sub(1);
+        let filtered = meta.filtered.saturating_sub(filtered).min(gap);
+        (filtered, gap - filtered)
+    }
+
+    /// What became of the samples since the flow was opened.
+    pub(super) fn books(&self) -> SentBooks {
+        self.books
+    }
+
+    /// Notes the payload of a sample that goes out, again or not.
+    pub(super) fn count_bytes(&mut self, bytes: usize) {
+        let bytes = u64::try_from(bytes).unwrap_or(u64::MAX);
+        self.books.bytes = self.books.bytes.saturating_add(bytes);
+    }
+
+    /// The oldest that waits is too old: the newest may still do.
+    pub(super) fn give_up(&mut self, want: Want) {
+        self.waits = match want {
+            Want::After(..) => Some(Time(0)),
+            Want::Newest | Want::At(..) => None,
+        };
     }
 
     /// How many were left out so far, for a sample that goes out once more.

@@ -31,7 +31,7 @@ pub(super) struct Order {
 enum Held {
     Sample(SampleMeta, Vec<u8>),
     /// This one and those up to it, from the key on, cannot be had any more.
-    Gone(Seq),
+    Gone(Seq, Why),
 }
 
 /// What comes next.
@@ -40,7 +40,16 @@ pub(super) enum Next {
     /// This sample.
     Sample(SampleMeta, Vec<u8>),
     /// So many samples cannot be had any more.
-    Gone(u64),
+    Gone(u64, Why),
+}
+
+/// Why samples cannot be had.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Why {
+    /// Newer ones took their place in the writer's ring.
+    Overwritten,
+    /// The contract keeps them back: they are too old.
+    LeftOut,
 }
 
 /// What to ask for.
@@ -67,11 +76,16 @@ impl Order {
         }
     }
 
+    /// Goes on after a sample that was delivered by another stream of the item.
+    pub(super) fn resume(&mut self, epoch: Epoch, after: Seq) {
+        (self.epoch, self.next) = (epoch, Some(Seq(after.0.saturating_add(1))));
+    }
+
     /// Newest sample that is here, delivered or held back.
     pub(super) fn newest(&self) -> Option<(Epoch, Seq)> {
         let held = self.held.last_key_value().map(|(seq, held)| match held {
             Held::Sample(..) => *seq,
-            Held::Gone(last) => *last,
+            Held::Gone(last, _) => *last,
         });
         let delivered = self.next.map(|next| Seq(next.0.saturating_sub(1)));
         let newest = held.into_iter().chain(delivered).max()?;
@@ -84,7 +98,7 @@ impl Order {
             None => true,
             Some(_) if meta.epoch > self.epoch => true,
             Some(next) => {
-                meta.epoch == self.epoch && meta.seq >= next && !self.held.contains_key(&meta.seq)
+                meta.epoch == self.epoch && meta.seq >= next && self.known_until(meta.seq).is_none()
             }
         }
     }
@@ -103,16 +117,27 @@ impl Order {
     }
 
     /// Notes that the samples from `first` to `last` cannot be had any more.
-    pub(super) fn gone(&mut self, epoch: Epoch, first: Seq, last: Seq, wait: Duration, now: Time) {
+    pub(super) fn gone(
+        &mut self,
+        epoch: Epoch,
+        (first, last): (Seq, Seq),
+        why: Why,
+        wait: Duration,
+        now: Time,
+    ) {
         let Some(next) = self.next.filter(|_| epoch == self.epoch) else {
             return;
         };
-        let first = first.max(next);
+        let mut first = first.max(next);
+        // Of what is known already nothing new is told, by a record that took its time.
+        while let Some(known) = self.known_until(first) {
+            first = Seq(known.0.saturating_add(1));
+        }
         // What is here already is not gone.
         let until = self.held.range(first..).next().map(|(seq, _)| *seq);
         let last = until.map_or(last, |seq| last.min(Seq(seq.0 - 1)));
         if first <= last {
-            self.held.insert(first, Held::Gone(last));
+            self.held.insert(first, Held::Gone(last, why));
         }
         self.last = (now, wait);
     }
@@ -137,9 +162,9 @@ impl Order {
                 self.next = Some(Seq(at.0.saturating_add(1)));
                 Some(Next::Sample(meta, payload))
             }
-            Held::Gone(last) => {
+            Held::Gone(last, why) => {
                 self.next = Some(Seq(last.0.saturating_add(1)));
-                Some(Next::Gone(last.0 - at.0 + 1))
+                Some(Next::Gone(last.0 - at.0 + 1, why))
             }
         }
     }
@@ -177,6 +202,16 @@ impl Order {
         (gaps, false)
     }
 
+    /// The last of the samples that are held, or known to be gone, together with this one; none if it is neither.
+    fn known_until(&self, seq: Seq) -> Option<Seq> {
+        let (at, held) = self.held.range(..=seq).next_back()?;
+        let last = match held {
+            Held::Sample(..) => *at,
+            Held::Gone(last, _) => *last,
+        };
+        (last >= seq).then_some(last)
+    }
+
     fn gaps(&self) -> Vec<Ask> {
         let Some(mut next) = self.next else {
             return Vec::new();
@@ -196,7 +231,7 @@ impl Order {
             }
             let last = match held {
                 Held::Sample(..) => *seq,
-                Held::Gone(last) => *last,
+                Held::Gone(last, _) => *last,
             };
             next = Seq(last.0.saturating_add(1));
         }
@@ -259,7 +294,7 @@ mod tests {
         let next = std::iter::from_fn(|| order.poll());
         next.map(|next| match next {
             Next::Sample(meta, _) => meta.seq.0,
-            Next::Gone(count) => 1_000 + count,
+            Next::Gone(count, _) => 1_000 + count,
         })
         .collect()
     }
@@ -289,13 +324,38 @@ mod tests {
         assert_eq!(drain(&mut order), []);
         let (asks, _) = order.due(RTT, WAIT, order.deadline().unwrap());
         assert_eq!((asks[0].first.0, asks[0].count), (1, 3));
-        order.gone(Epoch(1), Seq(1), Seq(2), WAIT, Time(0));
+        order.gone(Epoch(1), (Seq(1), Seq(2)), Why::Overwritten, WAIT, Time(0));
         insert(&mut order, 1, 3);
         assert_eq!(drain(&mut order), [1_002, 3, 4]);
         // A claim about what is here, or was delivered, changes nothing.
         insert(&mut order, 1, 6);
-        order.gone(Epoch(1), Seq(1), Seq(9), WAIT, Time(0));
+        order.gone(Epoch(1), (Seq(1), Seq(9)), Why::LeftOut, WAIT, Time(0));
         assert_eq!(drain(&mut order), [1_001, 6]);
+    }
+
+    #[test]
+    fn what_is_told_twice_or_comes_after_it_was_told_is_passed_over_once() {
+        let mut order = Order::new(false);
+        insert(&mut order, 1, 1);
+        assert_eq!(drain(&mut order), [1]);
+        let gone = |order: &mut Order, first, last| {
+            let span = (Seq(first), Seq(last));
+            order.gone(Epoch(1), span, Why::Overwritten, WAIT, Time(0));
+        };
+        // Held back by the second; told in pieces that overlap, and one of them arrives after all.
+        gone(&mut order, 3, 5);
+        gone(&mut order, 4, 7);
+        gone(&mut order, 3, 9);
+        assert!(!order.lacks(&meta(1, 6)));
+        insert(&mut order, 1, 6);
+        insert(&mut order, 1, 10);
+        assert_eq!(drain(&mut order), []);
+        let (asks, _) = order.due(RTT, WAIT, order.deadline().unwrap());
+        let asked: Vec<_> = asks.iter().map(|ask| (ask.first.0, ask.count)).collect();
+        assert_eq!(asked, [(2, 1)]);
+        insert(&mut order, 1, 2);
+        assert_eq!(drain(&mut order), [2, 1_003, 1_002, 1_002, 10]);
+        assert_eq!((order.held_bytes(), order.gaps().len()), (0, 0));
     }
 
     #[test]

@@ -12,6 +12,7 @@ use ddx_wire::sample::{FRAGMENT_RECORD_BYTES, Preamble, RECORD_BYTES, Record, Sa
 use ddx_wire::seal::{Lane, Sealer};
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
+use super::books::SentBooks;
 use super::congestion::{Congestion, Reporter};
 use super::flow::{Flow, Progress};
 use super::pace::{Pace, batch_bytes};
@@ -116,6 +117,15 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             datagram_bytes: self.datagram_bytes,
             waiting: self.hungry.len() + self.sending.len(),
         }
+    }
+
+    /// What became here of the samples of each stream.
+    pub(super) fn books(&self) -> impl Iterator<Item = (StreamId, SentBooks)> {
+        self.flows.iter().map(|(stream, flow)| {
+            let waiting = flow.waits.is_some();
+            let books = flow.books();
+            (*stream, SentBooks { waiting, ..books })
+        })
     }
 
     /// Opens a flow, or changes its contract.
@@ -259,19 +269,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             } else if flow.sent() >= Some(at) {
                 flow.waits = None;
             } else {
-                // Where each sample is wanted, what the ring let go is told.
-                if let (true, Some((epoch, Seq(last)))) = (flow.is_every(), flow.sent())
-                    && epoch == meta.epoch
-                    && meta.seq.0 > last + 1
-                {
-                    let gone = SampleMeta {
-                        epoch,
-                        seq: Seq(meta.seq.0 - 1),
-                        ..SampleMeta::default()
-                    };
-                    let count = meta.seq.0 - last - 1;
-                    self.push_gone(stream, &gone, count);
-                }
+                self.tell_gap(stream, meta);
                 offered = Some(self.admit(stream, meta, payload, None, now));
             }
             if let Some(flow) = self.flows.get_mut(&stream)
@@ -284,6 +282,61 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         }
         self.take_turns(stream);
         offered
+    }
+
+    /// Takes what a [`Fetch`] brought and the contract keeps back. Where each sample is wanted that is told.
+    pub(super) fn refused(
+        &mut self,
+        fetch: &Fetch,
+        meta: &SampleMeta,
+        newest: Option<(Epoch, Seq)>,
+    ) {
+        let stream = fetch.stream;
+        self.forget_turns(stream);
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return;
+        };
+        if let Want::At(..) = fetch.want {
+            if let Some(filled) = flow.fill(Some((meta.epoch, meta.seq))) {
+                if filled.gone > 0 {
+                    let gone = SampleMeta {
+                        epoch: filled.epoch,
+                        seq: filled.gone_until,
+                        ..SampleMeta::default()
+                    };
+                    self.push_gone(stream, &gone, filled.gone);
+                }
+                if filled.wanted {
+                    self.push_left_out(stream, meta);
+                }
+            }
+        } else if !fetch.again && flow.is_every() {
+            self.tell_gap(stream, meta);
+            self.leave_out(stream, meta);
+            if let Some(flow) = self.flows.get_mut(&stream)
+                && (flow.sent() >= newest || flow.sent() < Some((meta.epoch, meta.seq)))
+            {
+                flow.waits = None;
+            }
+        } else if !fetch.again {
+            flow.give_up(fetch.want);
+        }
+        self.take_turns(stream);
+    }
+
+    /// Tells that the contract keeps a sample back, of a stream of which each is wanted.
+    pub(super) fn leave_out(&mut self, stream: StreamId, meta: &SampleMeta) {
+        if let Some(flow) = self.flows.get_mut(&stream)
+            && flow.leave_out(meta)
+        {
+            self.push_left_out(stream, meta);
+        }
+    }
+
+    /// Whether samples of a stream wait in the store for their turn.
+    pub(super) fn waits(&self, stream: StreamId) -> bool {
+        let flow = self.flows.get(&stream);
+        flow.is_some_and(|flow| flow.waits.is_some())
     }
 
     /// A reader here needs the newest sample again.
@@ -557,6 +610,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         };
         let meta = SampleMeta { filtered, ..*meta };
         let bytes = payload.as_ref();
+        flow.count_bytes(bytes.len());
         flow.turn = flow.turn.max(self.turn);
         let offered = if large {
             let step = self.datagram_bytes - DATAGRAM_OVERHEAD - FRAGMENT_RECORD_BYTES;
@@ -605,6 +659,30 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             }
             self.lanes[0].push_padding(len);
         }
+    }
+
+    /// Where each sample is wanted, tells what the ring let go before this one.
+    fn tell_gap(&mut self, stream: StreamId, meta: &SampleMeta) {
+        let flow = self.flows.get(&stream).filter(|flow| flow.is_every());
+        if let Some((epoch, Seq(last))) = flow.and_then(Flow::sent)
+            && epoch == meta.epoch
+            && meta.seq.0 > last + 1
+        {
+            let gone = SampleMeta {
+                epoch,
+                seq: Seq(meta.seq.0 - 1),
+                ..SampleMeta::default()
+            };
+            self.push_gone(stream, &gone, meta.seq.0 - last - 1);
+        }
+    }
+
+    fn push_left_out(&mut self, stream: StreamId, meta: &SampleMeta) {
+        let left_out = SampleMeta {
+            filtered: 1,
+            ..*meta
+        };
+        self.push_gone(stream, &left_out, 1);
     }
 
     fn push_gone(&mut self, stream: StreamId, meta: &SampleMeta, count: u64) {

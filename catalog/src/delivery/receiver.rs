@@ -13,10 +13,10 @@ use ddx_wire::{Contract, Delivery, Epoch, Seq, StreamId, Tag, Time};
 use super::books::{Books, Failure, Ledger, Standing};
 use super::deadlines::Deadlines;
 use super::early::Early;
-use super::order::{Next, Order, is_later_epoch};
+use super::order::{Next, Order, Why, is_later_epoch};
 use super::reassembly::{Due, Place, Reassembly, Rules};
 use super::reception::Reception;
-use super::{Received, ReceiverEvent, TimerName, key};
+use super::{Passed, Received, ReceiverEvent, TimerName, key};
 
 /// Identity and limits of a [`Receiver`].
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -103,6 +103,7 @@ struct Ready {
     stream: StreamId,
     meta: SampleMeta,
     payload: Payload,
+    passed: Passed,
 }
 
 #[derive(Debug)]
@@ -159,18 +160,39 @@ impl Receiver {
     /// Expects a stream of a sender under a contract, and takes what came of it in the last second, before it was expected.
     /// One over the limit is not expected, and counted.
     pub fn listen(&mut self, tag: Tag, stream: StreamId, contract: &Contract, now: Time) {
+        self.resume(tag, stream, contract, None, now);
+    }
+
+    /// The same for one that goes on where another stream of the same item ended: with what follows the sample `after`.
+    pub fn resume(
+        &mut self,
+        tag: Tag,
+        stream: StreamId,
+        contract: &Contract,
+        after: Option<(Epoch, Seq)>,
+        now: Time,
+    ) {
         let known = self.streams.contains_key(&(tag, stream));
         if !known && self.streams.len() >= self.config.max_streams {
             self.counters.refused_streams += 1;
             return;
         }
-        self.streams.entry((tag, stream)).or_insert_with(|| Stream {
-            order: match contract.delivery {
-                Delivery::Latest => None,
-                Delivery::Every => Some(Order::new(false)),
-                Delivery::EveryFromRing => Some(Order::new(true)),
-            },
-            ..Stream::default()
+        self.streams.entry((tag, stream)).or_insert_with(|| {
+            let mut fresh = Stream {
+                order: match contract.delivery {
+                    Delivery::Latest => None,
+                    Delivery::Every => Some(Order::new(false)),
+                    Delivery::EveryFromRing => Some(Order::new(true)),
+                },
+                ..Stream::default()
+            };
+            if let Some((epoch, seq)) = after {
+                fresh.ledger.resume(epoch, seq);
+                if let Some(order) = &mut fresh.order {
+                    order.resume(epoch, seq);
+                }
+            }
+            fresh
         });
         if self.ready.is_empty() {
             self.inbox.clear();
@@ -259,6 +281,7 @@ impl Receiver {
             stream: ready.stream,
             meta: ready.meta,
             payload,
+            passed: ready.passed,
         })
     }
 
@@ -324,6 +347,13 @@ impl Receiver {
         Some(stream.ledger.books())
     }
 
+    /// The books of every expected stream.
+    pub fn all_books(&self) -> impl Iterator<Item = ((Tag, StreamId), Books)> {
+        self.streams
+            .iter()
+            .map(|(key, stream)| (*key, stream.ledger.books()))
+    }
+
     /// Totals since the start.
     pub fn counters(&self) -> ReceiverCounters {
         self.counters
@@ -383,8 +413,12 @@ impl Receiver {
         if record.gone {
             if let (Some(order), Some(count)) = (&mut stream.order, record.gone_count()) {
                 let meta = &record.meta;
-                let first = Seq(meta.seq.0 - count + 1);
-                order.gone(meta.epoch, first, meta.seq, patience, now);
+                let span = (Seq(meta.seq.0 - count + 1), meta.seq);
+                let why = match meta.filtered {
+                    0 => Why::Overwritten,
+                    _ => Why::LeftOut,
+                };
+                order.gone(meta.epoch, span, why, patience, now);
                 self.settle(tag, id, now);
             }
             return;
@@ -538,9 +572,9 @@ impl Receiver {
                 Some(Next::Sample(meta, payload)) => {
                     self.deliver(tag, id, &meta, Cow::Owned(payload), now);
                 }
-                Some(Next::Gone(count)) => {
+                Some(Next::Gone(count, why)) => {
                     if let Some(stream) = self.streams.get_mut(&(tag, id)) {
-                        stream.ledger.gone(count);
+                        stream.ledger.gone(count, why);
                     }
                 }
                 None => {
@@ -578,7 +612,7 @@ impl Receiver {
                 }
             }
         }
-        stream.ledger.deliver(meta);
+        let passed = stream.ledger.deliver(meta);
         self.ready_bytes += payload.len();
         let payload = match payload {
             Cow::Owned(bytes) => Payload::Large(bytes),
@@ -593,6 +627,7 @@ impl Receiver {
             stream: id,
             meta: *meta,
             payload,
+            passed,
         });
     }
 

@@ -7,8 +7,9 @@ use std::time::Duration;
 use ddx_wire::message::{Lacks, NackEntry, ReportEntry};
 use ddx_wire::sample::{MAX_SAMPLE_BYTES, SampleMeta};
 use ddx_wire::seal::{MAX_DATAGRAM_BYTES, Sealer};
-use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
+use ddx_wire::{Contract, Delivery, Epoch, Seq, StreamId, Tag, Time};
 
+use super::books::{SentBooks, SourceBooks};
 use super::deadlines::Deadlines;
 use super::path::{Offered, Path, PathLimits};
 use super::{
@@ -90,6 +91,9 @@ struct Stream {
     newest: Option<(Epoch, Seq)>,
     expired: Option<(Epoch, Seq)>,
     counters: StreamCounters,
+    books: SourceBooks,
+    /// Newest sample that was offered, whatever became of it.
+    offered: Option<(Epoch, Seq)>,
 }
 
 #[derive(Debug)]
@@ -143,6 +147,8 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             newest: None,
             expired: None,
             counters: StreamCounters::default(),
+            books: SourceBooks::default(),
+            offered: None,
         });
         let before = std::mem::take(&mut stream.destinations);
         stream.reroute(route, now);
@@ -214,7 +220,21 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             return;
         };
         let newest = Some(key(meta));
-        if newest <= stream.newest || !stream.admits(meta, payload.as_ref(), now) {
+        if newest <= stream.newest {
+            return;
+        }
+        let admitted = stream.admits(meta, payload.as_ref(), now);
+        stream.account(meta, payload.as_ref(), admitted);
+        if !admitted {
+            if stream.contract.delivery != Delivery::Latest {
+                for to in &stream.destinations {
+                    // What waits comes before it, and takes its own turn.
+                    if let Some(path) = self.paths.get_mut(to).filter(|path| !path.waits(id)) {
+                        path.leave_out(id, meta);
+                        enlist(&mut self.ready, &self.blocked, *to);
+                    }
+                }
+            }
             return;
         }
         let meta = &stream.advance(meta);
@@ -246,9 +266,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         let Some(stream) = self.streams.get_mut(&fetch.stream) else {
             return;
         };
-        let found = found.filter(|(meta, payload)| stream.admits(meta, payload.as_ref(), now));
+        let admitted = found.is_none_or(|(meta, p)| stream.admits(meta, p.as_ref(), now));
         let found = found.map(|(meta, payload)| (stream.complete(meta), payload));
-        if found.is_some() && fetch.again {
+        if found.is_some() && admitted && fetch.again {
             stream.counters.repeats += 1;
         }
         let newest = stream.newest;
@@ -256,7 +276,13 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             return;
         };
         let found = found.as_ref().map(|(meta, payload)| (meta, *payload));
-        let offered = path.fetched(fetch, found, newest, now);
+        let offered = match found {
+            Some((meta, _)) if !admitted => {
+                path.refused(fetch, meta, newest);
+                None
+            }
+            Some(_) | None => path.fetched(fetch, found, newest, now),
+        };
         self.hungry.insert(fetch.to);
         enlist(&mut self.ready, &self.blocked, fetch.to);
         if let (Some(Offered::Goes | Offered::Begins), Some((meta, _))) = (offered, found) {
@@ -429,6 +455,18 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
     /// Totals of an open stream.
     pub fn stream_counters(&self, id: StreamId) -> Option<StreamCounters> {
         self.streams.get(&id).map(|stream| stream.counters)
+    }
+
+    /// What became of the samples of each open stream before any went out.
+    pub fn source_books(&self) -> impl Iterator<Item = (StreamId, SourceBooks)> {
+        self.streams.iter().map(|(id, stream)| (*id, stream.books))
+    }
+
+    /// What became of the samples of each open stream at each of its destinations.
+    pub fn sent_books(&self) -> impl Iterator<Item = (StreamId, SocketAddr, SentBooks)> {
+        self.paths
+            .iter()
+            .flat_map(|(to, path)| path.books().map(|(stream, books)| (stream, *to, books)))
     }
 
     /// What is known of each destination in use.
@@ -621,6 +659,15 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
     }
 }
 
+/// How many samples come after the last one up to this; none if it is not newer. Before the first nothing is missed.
+fn ahead(last: Option<(Epoch, Seq)>, (epoch, Seq(seq)): (Epoch, Seq)) -> Option<u64> {
+    match last {
+        None => Some(1),
+        Some((before, _)) if before < epoch => Some(seq),
+        Some((before, Seq(last))) => seq.checked_sub(last).filter(|n| before == epoch && *n > 0),
+    }
+}
+
 fn enlist(ready: &mut VecDeque<SocketAddr>, blocked: &Deadlines<SocketAddr>, to: SocketAddr) {
     if !blocked.contains(&to) && !ready.contains(&to) {
         ready.push_back(to);
@@ -666,6 +713,29 @@ impl Stream {
         true
     }
 
+    /// Enters a sample that is offered, and those before it that were not.
+    fn account(&mut self, meta: &SampleMeta, payload: &[u8], admitted: bool) {
+        let Some(ahead) = ahead(self.offered, key(meta)) else {
+            return;
+        };
+        self.offered = Some(key(meta));
+        let books = &mut self.books;
+        books.expected = books.expected.saturating_add(ahead);
+        let missed = if self.contract.interval_ns() > 0 {
+            &mut books.rate_limited
+        } else {
+            &mut books.overwritten
+        };
+        *missed = missed.saturating_add(ahead.saturating_sub(1));
+        let fate = match admitted {
+            true => &mut books.delivered,
+            false if payload.len() > MAX_SAMPLE_BYTES => &mut books.too_large,
+            false => &mut books.expired,
+        };
+        *fate += 1;
+        books.bytes = books.bytes.saturating_add(payload.len() as u64);
+    }
+
     /// Takes note of a sample that goes out, and completes it by how many of its epoch were offered to no path.
     fn advance(&mut self, meta: &SampleMeta) -> SampleMeta {
         let meta = self.complete(meta);
@@ -680,6 +750,8 @@ impl Stream {
     fn complete(&self, meta: &SampleMeta) -> SampleMeta {
         let (epoch, Seq(seq)) = key(meta);
         let filtered = match self.newest {
+            // What is left out of these is told one by one.
+            _ if self.contract.delivery != Delivery::Latest => 0,
             Some((last, Seq(from))) if last == epoch => {
                 let skipped = seq.saturating_sub(from).saturating_sub(1);
                 self.filtered.saturating_add(skipped)

@@ -8,6 +8,8 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod every;
+
 const HOST: HostId = HostId([1; 16]);
 const LIFE: Incarnation = Incarnation {
     ordinal: 1,

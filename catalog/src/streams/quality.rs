@@ -29,6 +29,8 @@ struct Loss {
 struct Shunned {
     until: Time,
     pause: Duration,
+    /// Shares of datagrams lost by the group and by unicast when it was given up.
+    losses: (f64, f64),
 }
 
 impl Quality {
@@ -53,12 +55,14 @@ impl Quality {
         loss.weight = (loss.weight + all).min(WEIGHT);
         loss.share += (share - loss.share) * (all / loss.weight).min(1.0);
         let (share, weight) = (loss.share, loss.weight);
+        let unicast = self.unicast_loss();
         if path > GROUPS || weight < WEIGHT_MIN || !self.is_worse(share, weight) {
             return false;
         }
         let shunned = self.shunned.entry(path).or_insert(Shunned {
             until: now,
             pause: PAUSE_FIRST / 2,
+            losses: (0.0, 0.0),
         });
         if shunned.until > now {
             return false;
@@ -71,6 +75,7 @@ impl Quality {
             (shunned.pause * 2).min(PAUSE_MAX)
         };
         shunned.until = now + shunned.pause;
+        shunned.losses = (share, unicast);
         // The next trial begins without a memory.
         if let Some(loss) = self.paths.get_mut(&path) {
             (loss.share, loss.weight) = (0.0, 0.0);
@@ -95,9 +100,9 @@ impl Quality {
         share > other + LOSS_MORE + DEVIATIONS * deviation
     }
 
-    /// Whether some group is left alone because it does not work.
-    pub(super) fn shuns(&self) -> bool {
-        !self.shunned.is_empty()
+    /// Of a group that is left alone, or was: the shares of datagrams lost by it and by unicast when it was given up.
+    pub(super) fn shunned(&self, path: u16) -> Option<(f64, f64)> {
+        self.shunned.get(&path).map(|shunned| shunned.losses)
     }
 
     /// Share of datagrams lost on the way by unicast.

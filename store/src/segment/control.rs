@@ -6,10 +6,12 @@ use std::sync::Arc;
 
 use ddx_wire::Epoch;
 
-use super::{HeapSegment, SegmentError, Stamp, State};
+use super::{HeapSegment, ReaderBooks, SegmentError, Stamp, State};
 use crate::layout::{self, Header, MAX_PINS, Shape, Spec};
 use crate::notify::Bells;
-use crate::ring::{Words, load_stamp, peek, slot_is_intact, waiting_bells, waiting_now};
+use crate::ring::{
+    Words, cell_books, load_stamp, peek, slot_is_intact, waiting_bells, waiting_now,
+};
 use crate::shm::{Map, ShmError, memfd};
 use crate::sync::Ordering;
 
@@ -62,6 +64,16 @@ impl SegmentControl {
     pub fn newest(&self) -> Option<Stamp> {
         let (slot, stamp) = self.peek()?;
         slot_is_intact(&*self.data, &self.shape, slot, stamp.pos).then_some(stamp)
+    }
+
+    /// What the reader in a cell says that it has read; `None` when it is just saying something else.
+    pub fn reader_books(&self, cell: u32) -> Option<ReaderBooks> {
+        // A reader at full speed changes its books between two looks, but not between all of them.
+        const TRIES: u32 = 10;
+        if cell >= self.shape.spec().cells {
+            return None;
+        }
+        (0..TRIES).find_map(|_| ReaderBooks::from_words(&cell_books(&*self.ctl, &self.shape, cell)))
     }
 
     /// A bit for each cell whose reader has taken its seat, by the readers' own word.

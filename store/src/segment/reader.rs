@@ -8,7 +8,7 @@ use ddx_wire::Epoch;
 use thiserror::Error;
 
 use super::control::map_both;
-use super::{Bell, HeapSegment, Seat, SegmentError, SegmentFds, Stamp, State};
+use super::{Bell, HeapSegment, ReaderBooks, Seat, SegmentError, SegmentFds, Stamp, State};
 use crate::layout::{self, MAX_PINS, Spec};
 use crate::ring::{Miss, RingReader, STAMP_WORDS, Words, glance, load_stamp};
 use crate::shm::{Map, fork};
@@ -215,6 +215,14 @@ impl SegmentReader {
     pub fn set_waiting(&self, waiting: bool) {
         if !self.seated.is_forked() {
             self.seated.ring.set_waiting(waiting);
+        }
+    }
+
+    /// Shows the daemon what this reader has read.
+    #[inline]
+    pub fn set_books(&self, books: &ReaderBooks) {
+        if !self.seated.is_forked() {
+            self.seated.ring.set_books(&books.to_words());
         }
     }
 

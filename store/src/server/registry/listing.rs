@@ -5,9 +5,9 @@ use std::ops::Bound;
 
 use ddx_wire::{Epoch, HostName, ItemName, SchemaHash};
 
-use super::item::Item;
+use super::item::{Item, Tenure};
 use super::{Registry, RemoteItem, parse_schema};
-use crate::control::{Description, ItemEntry, ReaderEntry, Reply, SCHEMA_MAX_BYTES};
+use crate::control::{Description, ItemEntry, Newest, ReaderEntry, Reply, SCHEMA_MAX_BYTES};
 
 /// Items of one page: with the longest names, programs and schema names a page still fits one message.
 const PAGE: usize = 64;
@@ -61,6 +61,8 @@ impl Registry {
                 (None, None) => Epoch::default(),
             },
             published: tenure.map_or(0, |tenure| tenure.segment.control.head_pos()),
+            newest: tenure.and_then(newest),
+            depth: tenure.map_or(0, |tenure| tenure.segment.control.spec().depth),
             note: self
                 .notes
                 .get(name)
@@ -84,6 +86,10 @@ impl Registry {
                         .refused
                         .as_deref()
                         .map(|refused| cut(refused, REFUSED_MAX_BYTES)),
+                    books: reader.seat.and_then(|seat| {
+                        let tenure = item.tenure.as_ref()?;
+                        tenure.segment.control.reader_books(seat.cell)
+                    }),
                 })
             })
             .collect()
@@ -148,6 +154,16 @@ fn remote_entry(name: &ItemName, remote: &RemoteItem) -> ItemEntry {
         last_publish: None,
         capacity_bytes: description.capacity_bytes,
     }
+}
+
+fn newest(tenure: &Tenure) -> Option<Newest> {
+    let stamp = tenure.segment.control.newest()?;
+    Some(Newest {
+        pos: stamp.pos,
+        epoch: stamp.origin.epoch,
+        seq: stamp.origin.seq,
+        bytes: u64::try_from(stamp.len).unwrap_or(u64::MAX),
+    })
 }
 
 /// As much of a text as may be shown.

@@ -115,11 +115,15 @@ impl Rx {
         let mut arrived = Vec::new();
         while let Some(sample) = self.receiver.poll_sample() {
             let Received {
-                tag, stream, meta, ..
+                tag,
+                stream,
+                meta,
+                passed,
+                ..
             } = sample;
-            arrived.push((tag, stream, meta, sample.payload.to_vec()));
+            arrived.push((tag, stream, meta, sample.payload.to_vec(), passed));
         }
-        for (tag, stream, meta, payload) in &arrived {
+        for (tag, stream, meta, payload, passed) in &arrived {
             let (tag, stream) = (*tag, *stream);
             self.take(
                 &Received {
@@ -127,6 +131,7 @@ impl Rx {
                     stream,
                     meta: *meta,
                     payload,
+                    passed: *passed,
                 },
                 now,
             );
