@@ -1,5 +1,6 @@
 //! The command line: what can be typed, as data, and the one place that exits. One file for each verb.
 
+mod books;
 mod demo;
 mod doctor;
 mod get;
@@ -14,6 +15,7 @@ mod put;
 mod render;
 mod rm;
 mod source;
+mod stat;
 mod state;
 mod subscription;
 mod topic;
@@ -41,7 +43,7 @@ use crate::error::{Exit, Failure, Hint as _, Outcome};
     disable_help_flag = true,
     disable_version_flag = true,
     max_term_width = 80,
-    help_template = "{about}\n{usage-heading} {usage}\n\n{subcommands}\n\n{options}{after-help}",
+    help_template = "{about}\n{usage-heading} {usage}\n{subcommands}\n\n{options}{after-help}",
     after_help = "\
 Examples: ddx up                          serve this host
           ddx put speed 1.5 --type f64    write an item
@@ -85,6 +87,8 @@ enum Verb {
     Hz(hz::Args),
     /// Show all that is known of an item
     Info(info::Args),
+    /// Show what became of each sample, hop by hop
+    Stat(stat::Args),
     /// Say in one sentence why a reader gets nothing
     Why(why::Args),
     /// Check this host, and say what to do (multicast)
@@ -167,6 +171,7 @@ fn run(cli: Cli) -> Outcome {
         Verb::Watch(args) => watch::run(context, &args),
         Verb::Hz(args) => hz::run(context, &args),
         Verb::Info(args) => info::run(context, &args),
+        Verb::Stat(args) => stat::run(context, &args),
         Verb::Why(args) => why::run(context, &args),
         Verb::Doctor(args) => doctor::run(context, &args),
         Verb::Host(verb) => host::run(context, &verb),

@@ -1,12 +1,13 @@
 //! `ddx info`: one item in full.
 
-use ddx_store::{Description, ReaderEntry};
-use ddx_wire::HostName;
+use ddx_store::{Description, ReaderEntry, Store};
+use ddx_wire::{HostName, Pattern};
 use serde_json::{Value, json};
 
-use super::Context;
+use super::books::Books;
 use super::ls::{elapsed_ns, object, writer};
 use super::render::{Table, bytes, span};
+use super::{Context, state};
 use crate::error::{Exit, Hint as _, Outcome};
 
 /// Which item.
@@ -36,17 +37,44 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
                 item.readers.iter().map(reader_object).collect(),
             );
             fields.insert("path".to_owned(), json!(item.note));
+            fields.insert("ways".to_owned(), json!(travels(&store, &item)?));
         }
         context.out.object(&all)?;
         return Ok(Exit::Done);
     }
-    for line in lines(&item, store.host()) {
+    for line in lines(&item, store.host(), &travels(&store, &item)?) {
         context.out.line(&line)?;
     }
     Ok(Exit::Done)
 }
 
-fn lines(item: &Description, own: &HostName) -> Vec<String> {
+/// Each way of the item between this host and another: which, since when and why, and what its link carries.
+fn travels(store: &Store, item: &Description) -> anyhow::Result<Vec<String>> {
+    let now = ddx_store::now().0;
+    let ways = state::ways(store, &item.entry.name)?;
+    let mut texts: Vec<String> = ways.iter().map(|way| way.text(now)).collect();
+    if texts.is_empty() {
+        return Ok(texts);
+    }
+    let pattern = item.entry.name.as_str();
+    let pattern = Pattern::parse(pattern, store.host())?;
+    for row in Books::open(store)?.take(&pattern)?.rows {
+        if let Some(link) = row.link {
+            texts.push(format!(
+                "link to {}: {}/s, queue {}, loss {:.1} %, {} sent, {} left out",
+                row.peers.join(", "),
+                bytes(link.bytes_per_second),
+                span(link.queue_us.saturating_mul(1_000)),
+                link.loss_percent,
+                row.fates.delivered,
+                row.accounted() - row.fates.delivered
+            ));
+        }
+    }
+    Ok(texts)
+}
+
+fn lines(item: &Description, own: &HostName, travels: &[String]) -> Vec<String> {
     let entry = &item.entry;
     let written = entry.last_publish.map_or_else(
         || "?".to_owned(),
@@ -71,6 +99,7 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
         ),
         format!("path      {path}"),
     ];
+    lines.extend(travels.iter().map(|text| format!("          {text}")));
     if item.readers.is_empty() {
         lines.push("readers   none on this host".to_owned());
     } else {
@@ -81,7 +110,7 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
                 reader.program.clone(),
                 reader.pid.to_string(),
                 reader.contract.to_string(),
-                state(reader),
+                condition(reader),
             ]);
         }
         lines.extend(table.lines());
@@ -91,7 +120,7 @@ fn lines(item: &Description, own: &HostName) -> Vec<String> {
     lines
 }
 
-fn state(reader: &ReaderEntry) -> String {
+fn condition(reader: &ReaderEntry) -> String {
     match (&reader.refused, reader.bound) {
         (Some(reason), _) => format!("refused: {reason}"),
         (None, true) => "reads".to_owned(),

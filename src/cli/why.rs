@@ -1,9 +1,18 @@
-//! `ddx why`: one sentence on why a reader of an item gets nothing, or that all is well.
+//! `ddx why`: one sentence on why a reader of an item gets nothing or too little, or that all is well.
+//!
+//! It walks writer, store, contract, path, link and reader. What is missing altogether is seen at once; for all else it looks
+//! on for a second.
+
+mod flow;
+#[cfg(test)]
+mod tests;
 
 use ddx_store::{Description, Error, Refusal, Store};
 use ddx_wire::{ItemName, Pattern, WriterState};
 use serde_json::json;
 
+use self::flow::{Flow, Step};
+use super::books::Books;
 use super::ls::elapsed_ns;
 use super::render::span;
 use super::{Context, state};
@@ -15,6 +24,9 @@ use crate::error::{Exit, Hint as _, Outcome};
 pub(crate) struct Args {
     /// Name of the item
     name: String,
+    /// Say what was found at each step
+    #[arg(short, long)]
+    verbose: bool,
 }
 
 /// The answer.
@@ -26,6 +38,8 @@ pub(crate) struct Verdict {
     pub(crate) sentence: String,
     /// What to do about it.
     pub(crate) hint: Option<String>,
+    /// What was found on the way of a sample, as far as it got.
+    pub(crate) steps: Vec<Step>,
 }
 
 /// Why a reader gets nothing.
@@ -39,7 +53,19 @@ pub(crate) enum Reason {
     NothingWritten,
     SchemaMismatch,
     NoKey,
+    /// Other hosts are there, and seal with another key.
+    OtherKey,
     ReaderGone,
+    /// The contract keeps all of it back.
+    Contract,
+    /// It comes by unicast, because multicast does not work.
+    NoMulticast,
+    /// The link carries less than what is wanted of it.
+    SlowLink,
+    /// Too much is lost on the way.
+    Loss,
+    /// A reader takes less than what comes.
+    SlowReader,
 }
 
 /// All that the verdict rests on.
@@ -54,6 +80,10 @@ struct Facts<'a> {
     /// Names that exist, to guess what was meant.
     others: &'a [String],
     now_ns: u64,
+    /// Whether another host reads it from here.
+    read_elsewhere: bool,
+    /// Datagrams that were sealed with another key.
+    foreign: u64,
 }
 
 /// Runs the verb.
@@ -65,10 +95,19 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         "reason": verdict.reason.word(),
         "sentence": verdict.sentence,
         "hint": verdict.hint,
+        "steps": verdict.steps.iter().map(Step::object).collect::<Vec<_>>(),
     });
     context.out.either(&object, &verdict.sentence)?;
-    if let (false, Some(hint)) = (context.out.json, verdict.hint) {
+    if context.out.json {
+        return Ok(Exit::Done);
+    }
+    if let Some(hint) = &verdict.hint {
         context.out.line(&format!("hint: {hint}"))?;
+    }
+    if args.verbose {
+        for step in &verdict.steps {
+            context.out.line(&step.line())?;
+        }
     }
     Ok(Exit::Done)
 }
@@ -86,7 +125,8 @@ pub(crate) fn explain(store: &Store, name: &str) -> Result<Verdict, crate::error
         .into_iter()
         .map(|entry| entry.name.to_string())
         .collect();
-    Ok(verdict(&Facts {
+    let ways = state::ways(store, &name)?;
+    let missing = verdict(&Facts {
         local: name.is_under(store.host()) || name.is_admin(),
         name: &name,
         item: item.as_ref(),
@@ -94,7 +134,27 @@ pub(crate) fn explain(store: &Store, name: &str) -> Result<Verdict, crate::error
         hosts: &state::hosts(store)?,
         others: &others,
         now_ns: ddx_store::now().0,
-    }))
+        foreign: state::foreign(store)?,
+        read_elsewhere: ways.iter().any(|way| way.is_out),
+    });
+    let (Reason::Fine, Some(item)) = (missing.reason, item) else {
+        return Ok(missing);
+    };
+    let mut books = Books::open(store)?;
+    let pattern = Pattern::parse(name.as_str(), store.host()).arguments()?;
+    let before = books.take(&pattern)?;
+    books.wait()?;
+    let after = books.take(&pattern)?;
+    let rates = after.rates(&before);
+    let flow = Flow {
+        name: &name,
+        item: &item,
+        own: name.is_under(store.host()),
+        ways: &ways,
+        rows: after.rows.iter().zip(rates).collect(),
+        now_ns: ddx_store::now().0,
+    };
+    Ok(flow.judge(missing))
 }
 
 fn verdict(facts: &Facts<'_>) -> Verdict {
@@ -141,6 +201,13 @@ fn absent(host: Option<&state::Host>, facts: &Facts<'_>) -> Verdict {
         format!("this host has no item `{}`", facts.name)
     } else if host.is_some() {
         format!("host `{owner}` is up and has no item `{}`", facts.name)
+    } else if facts.foreign > 0 {
+        let sentence = format!(
+            "no host `{owner}` is known, and {} datagrams came that are sealed with another key",
+            facts.foreign
+        );
+        return Verdict::new(Reason::OtherKey, sentence)
+            .hint("give each host the same key file: `ddx up --key FILE`");
     } else {
         format!("no host `{owner}` is known")
     };
@@ -172,6 +239,27 @@ fn present(item: &Description, facts: &Facts<'_>) -> Verdict {
     }
     // Of another host's item this host has the samples only once a reader is bound to its mirror.
     let would_show = facts.local || item.readers.iter().any(|reader| reader.bound);
+    let picky = item
+        .readers
+        .iter()
+        .find(|reader| reader.contract.max_age_ms.is_some());
+    if item.published == 0
+        && would_show
+        && !facts.local
+        && let Some(reader) = picky
+    {
+        // It may be written all the time: what is too old does not leave its host.
+        let sentence = format!(
+            "nothing of `{name}` has come, and `{}` (pid {}) takes only what is at most {} ms old",
+            reader.program,
+            reader.pid,
+            reader.contract.max_age_ms.unwrap_or_default()
+        );
+        return Verdict::new(Reason::Contract, sentence).hint(format!(
+            "`ddx why {name}` on `{}` says whether what is written there is older",
+            name.prefix()
+        ));
+    }
     if item.published == 0 && would_show {
         let sentence = format!("`{program}` has opened `{name}` and written nothing yet");
         return Verdict::new(Reason::NothingWritten, sentence);
@@ -188,7 +276,7 @@ fn present(item: &Description, facts: &Facts<'_>) -> Verdict {
         let sentence = format!("`{name}` has no writer: `{program}` is gone{age}");
         return Verdict::new(Reason::NoWriter, sentence);
     }
-    if item.entry.readers == 0 {
+    if item.entry.readers == 0 && !facts.read_elsewhere {
         let sentence = format!("nobody on this host reads `{name}`; {keeper}{age}");
         return Verdict::new(Reason::ReaderGone, sentence);
     }
@@ -203,6 +291,7 @@ impl Verdict {
             reason,
             sentence,
             hint: None,
+            steps: Vec::new(),
         }
     }
 
@@ -224,163 +313,13 @@ impl Reason {
             Self::NothingWritten => "nothing-written",
             Self::SchemaMismatch => "schema-mismatch",
             Self::NoKey => "no-key",
+            Self::OtherKey => "other-key",
             Self::ReaderGone => "reader-gone",
+            Self::Contract => "contract",
+            Self::NoMulticast => "no-multicast",
+            Self::SlowLink => "slow-link",
+            Self::Loss => "loss",
+            Self::SlowReader => "slow-reader",
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use ddx_store::{ItemEntry, ReaderEntry};
-    use ddx_wire::{Contract, Epoch, HostName, SchemaHash, Time};
-
-    use super::*;
-
-    const NOW_NS: u64 = 10_000_000_000;
-
-    fn item(writer: WriterState) -> Description {
-        let host = HostName::parse("robot1").unwrap();
-        Description {
-            entry: ItemEntry {
-                name: ItemName::parse("robot1/gps/fix", &host).unwrap(),
-                host,
-                schema_name: "Fix".to_owned(),
-                schema_hash: SchemaHash::default(),
-                writer: Some(writer),
-                program: "gpsd".to_owned(),
-                pid: None,
-                readers: 1,
-                last_publish: Some(Time(NOW_NS - 2_000_000_000)),
-                capacity_bytes: 64,
-            },
-            schema: String::new(),
-            epoch: Epoch(1),
-            published: 7,
-            newest: None,
-            depth: 8,
-            readers: Vec::new(),
-            note: String::new(),
-        }
-    }
-
-    fn host(state: &str) -> state::Host {
-        state::Host {
-            host: "robot1".to_owned(),
-            id: String::new(),
-            state: state.to_owned(),
-            addr: None,
-            rtt_us: None,
-            loss_percent: None,
-            paths: Vec::new(),
-            since: Some(NOW_NS - 4_000_000_000),
-        }
-    }
-
-    fn ask(key: bool, hosts: &[state::Host], item: Option<&Description>) -> Verdict {
-        let base = HostName::parse("base").unwrap();
-        verdict(&Facts {
-            name: &ItemName::parse("robot1/gps/fix", &base).unwrap(),
-            local: false,
-            item,
-            key,
-            hosts,
-            others: &["robot1/gps/fox".to_owned()],
-            now_ns: NOW_NS,
-        })
-    }
-
-    #[test]
-    fn each_reason_has_its_sentence() {
-        let live = item(WriterState::Live);
-        let mut silent = item(WriterState::Live);
-        silent.published = 0;
-        silent.entry.last_publish = None;
-        silent.readers.push(ReaderEntry {
-            program: "map".to_owned(),
-            pid: 7,
-            contract: Contract::default(),
-            bound: true,
-            refused: None,
-            books: None,
-        });
-        let orphaned = item(WriterState::Orphaned);
-        let mut unread = item(WriterState::Live);
-        unread.entry.readers = 0;
-        let mut refused = item(WriterState::Live);
-        refused.readers.push(ReaderEntry {
-            program: "map".to_owned(),
-            pid: 7,
-            contract: Contract::default(),
-            bound: false,
-            refused: Some("field `latitude` is f32, f64 expected".to_owned()),
-            books: None,
-        });
-        let up = [host("up")];
-
-        for (verdict, reason, sentence) in [
-            (
-                ask(false, &[], None),
-                Reason::NoKey,
-                "this host has no key, so that it does not see `robot1`",
-            ),
-            (
-                ask(true, &[], None),
-                Reason::NoSuchName,
-                "no host `robot1` is known",
-            ),
-            (
-                ask(true, &up, None),
-                Reason::NoSuchName,
-                "host `robot1` is up and has no item `robot1/gps/fix`",
-            ),
-            (
-                ask(true, &[host("unreachable")], Some(&live)),
-                Reason::HostUnreachable,
-                "host `robot1` has been unreachable for 4.00 s",
-            ),
-            (
-                ask(true, &[host("left")], Some(&live)),
-                Reason::HostUnreachable,
-                "host `robot1` left 4.00 s ago",
-            ),
-            (
-                ask(true, &up, Some(&silent)),
-                Reason::NothingWritten,
-                "`gpsd` has opened `robot1/gps/fix` and written nothing yet",
-            ),
-            (
-                ask(true, &up, Some(&orphaned)),
-                Reason::NoWriter,
-                "`robot1/gps/fix` has no writer: `gpsd` is gone, the last value 2.00 s ago",
-            ),
-            (
-                ask(true, &up, Some(&refused)),
-                Reason::SchemaMismatch,
-                "`map` (pid 7) was refused: field `latitude` is f32, f64 expected",
-            ),
-            (
-                ask(true, &up, Some(&unread)),
-                Reason::ReaderGone,
-                "nobody on this host reads `robot1/gps/fix`; `gpsd` writes it, the last value 2.00 s ago",
-            ),
-            (
-                ask(true, &up, Some(&live)),
-                Reason::Fine,
-                "all is well with `robot1/gps/fix`: `gpsd` writes it, the last value 2.00 s ago; 1 read it here",
-            ),
-        ] {
-            assert_eq!(verdict.reason, reason, "{sentence}");
-            assert_eq!(verdict.sentence, sentence);
-        }
-    }
-
-    #[test]
-    fn a_name_that_is_almost_right_is_guessed() {
-        let verdict = ask(true, &[host("up")], None);
-
-        assert_eq!(
-            verdict.hint.as_deref(),
-            Some("did you mean `robot1/gps/fox`?")
-        );
     }
 }

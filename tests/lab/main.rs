@@ -5,16 +5,18 @@
 //! |---|---|
 //! | `interest.rs` | nothing is sent until somebody reads, then once, and no longer than somebody reads |
 //! | `hosts.rs` | hosts join, leave, die, are cut off, and come back; a host without a network is whole |
+//! | `books.rs` | each sample is accounted for on each hop, and a reader is told exactly what it missed and why |
 //! | `doctor.rs` | `ddx doctor` tells by direction where multicast does not pass |
 //! | `load.rs` | the books balance under load, and the last value arrives under loss |
 //! | `paths.rs` | samples flow on when interfaces come, go and change address |
-//! | `why.rs` | `ddx why` names the cause |
+//! | `why.rs`, `why_flow.rs` | `ddx why` names the cause |
 
 #![expect(
     clippy::unwrap_used,
     reason = "a helper of a test fails the test, as the test itself would"
 )]
 
+mod books;
 mod doctor;
 mod hosts;
 mod interest;
@@ -23,3 +25,4 @@ mod paths;
 mod program;
 mod site;
 mod why;
+mod why_flow;

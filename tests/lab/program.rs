@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use ddx_rig::lab::{Host, Process};
 use ddx_store::{ReaderOptions, Schema, Store, WaitKey, WaitSet, Writer, WriterOptions};
+use ddx_wire::{Delivery, Time};
 use serde::{Deserialize, Serialize};
 
 /// What a program can be told.
@@ -28,10 +29,34 @@ pub(crate) enum Order {
     },
     /// Open readers of `count` items.
     OpenReaders { prefix: String, count: usize },
+    /// Open readers of `count` items that ask for something.
+    OpenReadersAs {
+        prefix: String,
+        count: usize,
+        asked: Asked,
+    },
+    /// Write values whose content was true `age_ms` ago.
+    WriteAged {
+        first: u64,
+        count: u64,
+        period_us: u64,
+        age_ms: u64,
+    },
+    /// Read one sample of every reader each period, so often.
+    ReadSlowly { count: u64, period_us: u64 },
     /// Read until every reader has `value` or a higher one.
     Read { value: u64, within_ms: u64 },
     /// Close all readers.
     CloseReaders,
+}
+
+/// What readers ask of the source.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct Asked {
+    pub(crate) every: bool,
+    pub(crate) rate_hz: Option<f64>,
+    pub(crate) max_age_ms: Option<u64>,
 }
 
 /// What it answers, or why it failed.
@@ -129,6 +154,17 @@ impl Program {
     pub(crate) fn open_readers(&mut self, prefix: &str, count: usize) {
         let prefix = prefix.to_owned();
         self.ask(&Order::OpenReaders { prefix, count });
+    }
+
+    /// Opens readers of `prefix/0` and up that ask for something.
+    #[track_caller]
+    pub(crate) fn open_readers_as(&mut self, prefix: &str, count: usize, asked: Asked) {
+        let prefix = prefix.to_owned();
+        self.ask(&Order::OpenReadersAs {
+            prefix,
+            count,
+            asked,
+        });
     }
 
     /// Writes one value to every item; returns when.
@@ -242,14 +278,38 @@ impl Worker {
                 bytes,
             } => self.write(first, count, period_us, bytes)?,
             Order::OpenReaders { prefix, count } => {
-                for name in names(&prefix, count) {
-                    let reader = self.store.raw_reader(
-                        &name,
-                        Some(&Schema::bytes()),
-                        ReaderOptions::default(),
-                    )?;
-                    let key = self.set.add(reader);
-                    self.readers.insert(key, Book::default());
+                self.open_readers(&prefix, count, Asked::default())?;
+            }
+            Order::OpenReadersAs {
+                prefix,
+                count,
+                asked,
+            } => self.open_readers(&prefix, count, asked)?,
+            Order::WriteAged {
+                first,
+                count,
+                period_us,
+                age_ms,
+            } => {
+                for value in first..first + count {
+                    thread::sleep(Duration::from_micros(period_us));
+                    let capture = Time(ddx_store::now().0 - age_ms * 1_000_000);
+                    for writer in &mut self.writers {
+                        writer.write_at(&value.to_le_bytes().to_vec(), capture)?;
+                    }
+                }
+            }
+            Order::ReadSlowly { count, period_us } => {
+                let mut payload = Vec::new();
+                let mut next = Instant::now();
+                for _ in 0..count {
+                    thread::sleep(next.saturating_duration_since(Instant::now()));
+                    next += Duration::from_micros(period_us);
+                    for key in self.readers.keys() {
+                        if let Some(reader) = self.set.reader(*key) {
+                            reader.next_into(&mut payload, Duration::ZERO)?;
+                        }
+                    }
                 }
             }
             Order::Read { value, within_ms } => {
@@ -265,6 +325,31 @@ impl Worker {
             at_ns: Some(ddx_store::now().0),
             books: Vec::new(),
         })
+    }
+
+    fn open_readers(
+        &mut self,
+        prefix: &str,
+        count: usize,
+        asked: Asked,
+    ) -> Result<(), ddx_store::Error> {
+        let options = ReaderOptions {
+            rate: asked.rate_hz,
+            max_age: asked.max_age_ms.map(Duration::from_millis),
+            delivery: match asked.every {
+                true => Delivery::Every,
+                false => Delivery::Latest,
+            },
+            ..ReaderOptions::default()
+        };
+        for name in names(prefix, count) {
+            let reader = self
+                .store
+                .raw_reader(&name, Some(&Schema::bytes()), options)?;
+            let key = self.set.add(reader);
+            self.readers.insert(key, Book::default());
+        }
+        Ok(())
     }
 
     fn write(

@@ -94,7 +94,7 @@ fn why_names_each_cause() {
 impl Site {
     /// Waits until `ddx why` on a host gives this reason for an item, in a sentence that holds all of `parts`.
     #[track_caller]
-    fn wait_why(&self, host: &str, item: &str, reason: &str, parts: &[&str]) {
+    pub(crate) fn wait_why(&self, host: &str, item: &str, reason: &str, parts: &[&str]) {
         let what = format!("`ddx why {item}` on {host} to say {reason} with {parts:?}");
         wait(&what, PATIENCE, || {
             let said = self.ddx(host, &["why", item]);
