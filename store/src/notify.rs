@@ -11,7 +11,7 @@ use std::time::Duration;
 use crate::layout::{LINE, LINE_WORDS};
 use crate::ring::Words;
 use crate::shm::{Map, ShmError, fork, heap, memfd};
-use crate::sync::{Ordering, Site, fence};
+use crate::sync::{Ordering, Site, fence, order};
 
 /// Clients that can have a bell: the daemon's limit of connections.
 pub const MAX_CLIENTS: u16 = 1024;
@@ -22,9 +22,10 @@ pub const DIRTY_BITS: u16 = 512;
 pub const MAX_SLICE: Duration = Duration::from_millis(100);
 
 const DIRTY_WORDS: usize = 8;
-/// The word of a client's line that waiters sleep on: a count of rings.
+/// The word of a client's line that waiters sleep on: a count of wake-ups.
 pub const RUNG: usize = 0;
-/// Threads of the client that are about to sleep, or do.
+/// Not 0 while threads of the client may be about to sleep, or sleep: who clears it wakes them all, so that of many rings
+/// only the first enters the kernel.
 const ARMED: usize = 1;
 const DIRTY: usize = 2;
 
@@ -37,7 +38,7 @@ pub struct Bell {
     pub bit: u16,
 }
 
-/// What [`Bells::arm`] saw; the sleep ends at once when somebody has rung since.
+/// What [`Bells::arm`] saw; the sleep ends at once when somebody has been woken since.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Seen(u32);
 
@@ -101,7 +102,7 @@ impl Bells {
     }
 
     /// Marks the bit dirty and wakes the client if it sleeps. Whatever the caller stored before is seen by the woken
-    /// or by a waiter's last look. Enters the kernel only for an armed client.
+    /// or by a waiter's last look. Enters the kernel only for an armed client, and disarms it.
     pub fn ring(&self, bell: Bell) {
         if fork::is_past(self.generation) {
             return;
@@ -113,7 +114,7 @@ impl Bells {
     }
 
     /// Announces that the caller is about to sleep. After this it looks once more at everything it waits for, and
-    /// calls [`Bells::wait`] or [`Bells::disarm`].
+    /// calls [`Bells::wait`]; if it does not, the next ring enters the kernel in vain.
     pub fn arm(&self, client: u16) -> Seen {
         if fork::is_past(self.generation) {
             return Seen(0);
@@ -121,22 +122,14 @@ impl Bells {
         Seen(arm(&self.map, line(client)))
     }
 
-    /// Takes back an [`Bells::arm`] that no sleep follows.
-    pub fn disarm(&self, client: u16) {
-        if !fork::is_past(self.generation) {
-            disarm(&self.map, line(client));
-        }
-    }
-
-    /// Sleeps until the client's bell is rung, `timeout` or [`MAX_SLICE`] has passed, or a signal came; then disarms.
-    /// May wake for no reason: the caller looks for itself.
+    /// Sleeps until the client's bell is rung, `timeout` or [`MAX_SLICE`] has passed, or a signal came. May
+    /// wake for no reason: the caller looks for itself.
     pub fn wait(&self, client: u16, seen: Seen, timeout: Duration) {
         if fork::is_past(self.generation) {
             return;
         }
         self.map
             .sleep(line(client) + RUNG, seen.0, timeout.min(MAX_SLICE));
-        self.disarm(client);
     }
 
     /// Takes the bits rung since the last call. With several waiting threads in one client, bits may have been
@@ -145,14 +138,7 @@ impl Bells {
         if fork::is_past(self.generation) {
             return [0; DIRTY_WORDS];
         }
-        let first = line(client) + DIRTY;
-        // A glance first: most words are clean, and a swap would take the line from its writers.
-        std::array::from_fn(
-            |word| match self.map.load(first + word, Ordering::Relaxed) {
-                0 => 0,
-                _ => self.map.fetch_and(first + word, 0, Ordering::Relaxed),
-            },
-        )
+        take_dirty(&self.map, line(client))
     }
 
     /// Clears a client's line for its next owner.
@@ -171,27 +157,49 @@ fn line(client: u16) -> usize {
     usize::from(client % MAX_CLIENTS) * LINE_WORDS
 }
 
-/// Rings the bell at word `line`: true when somebody may sleep there. Generic for models.
+/// Rings the bell at word `line`: true when those who sleep there are to be woken. Generic for models.
 pub fn ring<W: Words>(bells: &W, line: usize, bit: u16) -> bool {
-    let word = usize::from(bit / 64) % DIRTY_WORDS;
-    bells.fetch_or(line + DIRTY + word, 1 << (bit % 64), Ordering::Relaxed);
-    bells.fetch_add(line + RUNG, 1, Ordering::Relaxed);
-    // SeqCst: pairs with the fence in `arm`.
+    let word = line + DIRTY + usize::from(bit / 64) % DIRTY_WORDS;
+    let mask = 1 << (bit % 64);
+    // SeqCst: pairs with the fences in `arm` and `take_dirty`. A bit that is still set will be taken after this, so that
+    // whoever takes it sees what the caller stored, and the line stays with its owner.
     fence(Site::RingFence);
-    bells.load(line + ARMED, Ordering::Relaxed) != 0
+    if bells.load(word, Ordering::Relaxed) & mask == 0 {
+        bells.fetch_or(word, mask, Ordering::Relaxed);
+        // SeqCst: pairs with the fence in `arm`, behind which the bits are taken once more.
+        fence(Site::RingFence);
+    }
+    let armed = line + ARMED;
+    let wakes = bells.load(armed, Ordering::Relaxed) != 0
+        // Acquire: pairs with the Release in `arm`, whose count was read before it.
+        && bells.fetch_and(armed, 0, order(Site::ArmSwap)) != 0;
+    if wakes {
+        // After the swap: who armed before it and does not sleep yet finds another count, and does not.
+        bells.fetch_add(line + RUNG, 1, Ordering::Relaxed);
+    }
+    wakes
 }
 
-/// Arms the bell at word `line` and returns the count of rings to sleep on, of which the futex compares 32 bits.
-/// Generic for models.
+/// Arms the bell at word `line` and returns the count to sleep on, of which the futex compares 32 bits. Generic for models.
 pub fn arm<W: Words>(bells: &W, line: usize) -> u32 {
-    bells.fetch_add(line + ARMED, 1, Ordering::Relaxed);
+    // Read first: the count from after a swap of this arming would be slept on although its wake-up is over.
     let rung = bells.load(line + RUNG, Ordering::Relaxed);
+    // Release: pairs with the Acquire in `ring`.
+    bells.fetch_or(line + ARMED, 1, order(Site::ArmStore));
     // SeqCst: pairs with the fences in `RingWriter::publish`, `ring::waiting_now` and `ring`.
     fence(Site::ArmFence);
     u32::try_from(rung & u64::from(u32::MAX)).unwrap_or(0)
 }
 
-fn disarm<W: Words>(bells: &W, line: usize) {
-    // Wraps when somebody has zeroed it meanwhile: then the client is woken needlessly until it is reset.
-    bells.fetch_add(line + ARMED, u64::MAX, Ordering::Relaxed);
+/// Takes the dirty bits at word `line`; what was stored before they were set can be seen after this. Generic for models.
+pub fn take_dirty<W: Words>(bells: &W, line: usize) -> [u64; DIRTY_WORDS] {
+    let first = line + DIRTY;
+    // A glance first: most words are clean, and a swap would take the line from its writers.
+    let dirty = std::array::from_fn(|word| match bells.load(first + word, Ordering::Relaxed) {
+        0 => 0,
+        _ => bells.fetch_and(first + word, 0, Ordering::Relaxed),
+    });
+    // SeqCst: pairs with the fence in `ring`.
+    fence(Site::TakeFence);
+    dirty
 }

@@ -41,26 +41,40 @@ pub enum Site {
     ArmFence,
     /// Daemon: full fence between a change of the state and its look at who waits. Pairs with [`Site::ArmFence`].
     StateFence,
-    /// Waker: full fence between what it changed and its look at the armed count. Pairs with [`Site::ArmFence`].
+    /// Waker: full fence between what it changed and its look at the dirty bit, and again before that at the armed word.
+    /// Pairs with [`Site::TakeFence`] and [`Site::ArmFence`].
     RingFence,
+    /// Waiter: full fence between its taking of dirty bits and its look at what they stand for. Pairs with
+    /// [`Site::RingFence`] and [`Site::PublishFence`].
+    TakeFence,
+    /// Waiter: the armed word, after the count of wake-ups was read. Pairs with [`Site::ArmSwap`]. No model fails without
+    /// these two: loom lets no load see a later store.
+    ArmStore,
+    /// Waker: the armed word, before the count is raised. Pairs with [`Site::ArmStore`].
+    ArmSwap,
 }
 
 impl Site {
     /// The ordering this site needs.
     pub const fn ordering(self) -> Ordering {
         match self {
-            Self::RingStore | Self::HeadStore | Self::PinStore | Self::VoidFence => {
-                Ordering::Release
-            }
-            Self::HeadLoad | Self::PinScan | Self::PeekFence | Self::IntactFence => {
-                Ordering::Acquire
-            }
+            Self::RingStore
+            | Self::HeadStore
+            | Self::PinStore
+            | Self::VoidFence
+            | Self::ArmStore => Ordering::Release,
+            Self::HeadLoad
+            | Self::PinScan
+            | Self::PeekFence
+            | Self::IntactFence
+            | Self::ArmSwap => Ordering::Acquire,
             // SeqCst fences, never SeqCst accesses: loom models only the former.
             Self::PublishFence
             | Self::PinFence
             | Self::ArmFence
             | Self::StateFence
-            | Self::RingFence => Ordering::SeqCst,
+            | Self::RingFence
+            | Self::TakeFence => Ordering::SeqCst,
         }
     }
 }

@@ -106,14 +106,10 @@ fn sleep_until_ready(
         let slice = match condition.readiness() {
             Ok(Readiness::Waiting) => MAX_SLICE,
             Ok(Readiness::In(span)) => span.min(MAX_SLICE),
-            ready => {
-                bells.disarm(client);
-                return ready.map(|_| true);
-            }
+            ready => return ready.map(|_| true),
         };
         let left = patience.left();
         if left.is_zero() {
-            bells.disarm(client);
             return Ok(false);
         }
         bells.wait(client, seen, slice.min(left));

@@ -13,6 +13,7 @@ use crate::connection::Connection;
 use crate::notify::{Bell, Bells, MAX_SLICE};
 use crate::reader::RawReader;
 use crate::store::Store;
+use crate::sync::{Site, fence};
 use crate::wait::Readiness;
 
 /// Names a reader in its set; never used twice.
@@ -88,6 +89,22 @@ impl WaitSet {
         self.marked.insert(key);
     }
 
+    /// Lets the writer of this reader's item ring no bell: who has no use for news is not woken by it.
+    pub fn mute(&mut self, key: WaitKey) {
+        if let Some(reader) = self.reader(key) {
+            reader.set_waiting(false);
+        }
+    }
+
+    /// Has the bell rung again, to be followed by a look at what came meanwhile.
+    pub fn unmute(&mut self, key: WaitKey) {
+        if let Some(reader) = self.reader(key) {
+            reader.set_waiting(true);
+            // SeqCst: pairs with the fence in `RingWriter::publish`.
+            fence(Site::ArmFence);
+        }
+    }
+
     /// A handle that ends the sleep.
     pub fn waker(&self) -> Waker {
         Waker {
@@ -100,14 +117,15 @@ impl WaitSet {
     pub fn wait(&mut self, timeout: Duration, rung: &mut Vec<WaitKey>) {
         rung.clear();
         let (bells, client) = self.connection.bell();
-        let seen = bells.arm(client);
-        // Whoever called the waker before the bell was armed must be heard now: the bell does not ring again for it.
+        // Before the bell is armed: writers that ring a busy thread have no need to enter the kernel.
         let woken = self.take(&bells, client, rung);
-        if woken || !rung.is_empty() || timeout.is_zero() {
-            bells.disarm(client);
-        } else {
-            bells.wait(client, seen, timeout.min(MAX_SLICE));
-            self.take(&bells, client, rung);
+        if !woken && rung.is_empty() && !timeout.is_zero() {
+            let seen = bells.arm(client);
+            // Whoever called the waker before the bell was armed must be heard now: the bell does not ring again for it.
+            if !self.take(&bells, client, rung) && rung.is_empty() {
+                bells.wait(client, seen, timeout.min(MAX_SLICE));
+                self.take(&bells, client, rung);
+            }
         }
         for &key in rung.iter() {
             self.listen(key);

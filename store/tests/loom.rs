@@ -473,6 +473,58 @@ fn no_ring_is_slept_through(weakened: Option<Site>) {
     });
 }
 
+/// A client goes to sleep while two others ring its bell: the second may find it disarmed by the first.
+fn no_second_ring_is_slept_through(weakened: Option<Site>) {
+    check_with(3, weakened, || {
+        let (bells, futex) = bells();
+        let news: [_; 2] = std::array::from_fn(|_| Arc::new(AtomicU64::new(0)));
+        let first = {
+            let (bells, futex, news) = (Arc::clone(&bells), Arc::clone(&futex), news[0].clone());
+            thread::spawn(move || {
+                news.store(1, Ordering::Relaxed);
+                ring(&bells, &futex);
+            })
+        };
+        let second = {
+            let (bells, futex, news) = (Arc::clone(&bells), Arc::clone(&futex), news[1].clone());
+            thread::spawn(move || {
+                news.store(1, Ordering::Relaxed);
+                ring(&bells, &futex);
+            })
+        };
+        let seen = notify::arm(&bells, 0);
+        // What the first has to say does not end the wait.
+        if news[1].load(Ordering::Relaxed) == 0 {
+            futex.wait(&bells, seen);
+        }
+        first.join().unwrap();
+        second.join().unwrap();
+        assert!(!*futex.asleep.lock().unwrap(), "a wake-up was lost");
+    });
+}
+
+/// A client takes its dirty bits while a writer finds one of them still set.
+fn no_dirty_bit_is_taken_too_soon(weakened: Option<Site>) {
+    check(weakened, || {
+        let (bells, _futex) = bells();
+        let news = Arc::new(AtomicU64::new(0));
+        notify::ring(&bells, 0, 0);
+        let thread = {
+            let (bells, news) = (Arc::clone(&bells), Arc::clone(&news));
+            thread::spawn(move || {
+                news.store(1, Ordering::Relaxed);
+                notify::ring(&bells, 0, 0);
+            })
+        };
+        let taken = notify::take_dirty(&bells, 0)[0] != 0;
+        let saw = news.load(Ordering::Relaxed) != 0;
+        thread.join().unwrap();
+        assert!(taken);
+        let left = notify::take_dirty(&bells, 0)[0] != 0;
+        assert!(saw || left, "a ring was lost");
+    });
+}
+
 #[test]
 fn two_readers_pin() {
     pinned_slots_are_left_alone(None, 2);
@@ -522,6 +574,16 @@ fn waking_for_states() {
 #[test]
 fn waking_for_rings() {
     no_ring_is_slept_through(None);
+}
+
+#[test]
+fn waking_for_the_second_of_two_rings() {
+    no_second_ring_is_slept_through(None);
+}
+
+#[test]
+fn taking_dirty_bits() {
+    no_dirty_bit_is_taken_too_soon(None);
 }
 
 #[test]
@@ -648,4 +710,16 @@ fn weak_state_fence() {
 #[should_panic(expected = "a wake-up was lost")]
 fn weak_ring_fence() {
     no_ring_is_slept_through(Some(Site::RingFence));
+}
+
+#[test]
+#[should_panic(expected = "a ring was lost")]
+fn weak_ring_fence_for_dirty_bits() {
+    no_dirty_bit_is_taken_too_soon(Some(Site::RingFence));
+}
+
+#[test]
+#[should_panic(expected = "a ring was lost")]
+fn weak_take_fence() {
+    no_dirty_bit_is_taken_too_soon(Some(Site::TakeFence));
 }
