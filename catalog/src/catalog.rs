@@ -30,6 +30,8 @@ use crate::streams::{StreamOut, Streams};
 mod beacon;
 mod handle;
 
+/// A host of which something came so recently is not probed by membership: a little more than the pause between two digests.
+const SIGN_OF_LIFE: Duration = Duration::from_millis(1_100);
 /// Membership datagrams that wait for a session with their destination.
 const WAITING_MAX: usize = 256;
 
@@ -477,7 +479,12 @@ impl Catalog {
         }
         while let Some((to, bytes)) = self.membership.poll_send() {
             let tag = to.tag();
+            let host = self.hosts.get(to.host).filter(|host| host.tag == tag);
+            let is_heard = host.is_some_and(|host| now.since(host.heard) < SIGN_OF_LIFE);
             if self.sessions.get(tag).is_some() {
+                if is_heard && self.membership.answer(&to, &bytes, now) {
+                    continue;
+                }
                 self.out.send(tag, &Message::Swim(bytes));
                 continue;
             }

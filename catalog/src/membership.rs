@@ -12,13 +12,17 @@ use std::time::Duration;
 use bytes::{Buf, BufMut};
 use ddx_wire::codec::{self, CodecError};
 use ddx_wire::{HostId, HostName, Incarnation, Tag, Time};
-use foca::{Foca, Header, Member, Message, NoCustomBroadcast, Notification, Runtime, State, Timer};
+use foca::{
+    Codec, Foca, Header, Member, Message, NoCustomBroadcast, Notification, Runtime, State, Timer,
+};
 use serde::{Deserialize, Serialize};
 
 use crate::rng::Rng;
 
 /// Greatest datagram of the membership protocol, bytes: leaves room for the message around it.
 const PACKET_MAX_BYTES: usize = 1_100;
+/// What `foca` writes where it has nothing to tell of others; left out, it reads the same.
+const NO_MEMBERS: [u8; 2] = [0; 2];
 /// Timers that may be under way; the protocol needs a handful for each suspect.
 const TIMERS_MAX: usize = 65_536;
 
@@ -87,10 +91,58 @@ impl Membership {
         debug_assert!(told.is_ok(), "an entry fits a datagram");
     }
 
-    /// Takes in a datagram. `false` when it was malformed.
-    pub(crate) fn handle_datagram(&mut self, bytes: &[u8], now: Time) -> bool {
+    /// Takes in what a host sent in a session. `false` when it was malformed.
+    pub(crate) fn handle_datagram(&mut self, from: &Entry, bytes: &[u8], now: Time) -> bool {
+        let Ok((brief, used)) = codec::decode_prefix::<BriefHeader>(bytes) else {
+            return false;
+        };
+        let src = Entry {
+            rejoin: brief.from_rejoin,
+            ..from.clone()
+        };
+        let dst = Entry {
+            rejoin: brief.to_rejoin,
+            ..self.foca.identity().clone()
+        };
+        let header = Header {
+            src,
+            src_incarnation: brief.refutations,
+            dst,
+            message: brief.message.into_foca(),
+        };
+        self.handle(&header, bytes.get(used..).unwrap_or_default(), now)
+    }
+
+    fn handle(&mut self, header: &Header<Entry>, members: &[u8], now: Time) -> bool {
         self.effects.now = now;
-        self.foca.handle_data(bytes, &mut self.effects).is_ok()
+        let mut bytes = Vec::with_capacity(256);
+        let headed = EntryCodec.encode_header(header, &mut bytes);
+        bytes.extend_from_slice(members);
+        headed.is_ok() && self.foca.handle_data(&bytes, &mut self.effects).is_ok()
+    }
+
+    /// Answers a probe for a host that is heard anyway, in its place. `false` when there is something to tell it.
+    pub(crate) fn answer(&mut self, to: &Entry, bytes: &[u8], now: Time) -> bool {
+        let Ok((brief, used)) = codec::decode_prefix::<BriefHeader>(bytes) else {
+            return false;
+        };
+        let WireMessage::Ping(number) = brief.message else {
+            return false;
+        };
+        let member = self.foca.iter_members().find(|member| member.id() == to);
+        let Some(member) = member.cloned() else {
+            return false;
+        };
+        if used < bytes.len() || member.state() != State::Alive {
+            return false;
+        }
+        let header = Header {
+            src: member.id().clone(),
+            src_incarnation: member.incarnation(),
+            dst: self.foca.identity().clone(),
+            message: Message::Ack(number),
+        };
+        self.handle(&header, &[], now)
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Time) {
@@ -209,7 +261,23 @@ impl Runtime<Entry> for Effects {
     }
 
     fn send_to(&mut self, to: Entry, bytes: &[u8]) {
-        self.sends.push_back((to, bytes.to_vec()));
+        // What this file has encoded can be decoded.
+        if let Ok((header, used)) = codec::decode_prefix::<WireHeader>(bytes) {
+            let brief = BriefHeader {
+                from_rejoin: header.from.rejoin,
+                refutations: header.refutations,
+                to_rejoin: header.to.rejoin,
+                message: header.message,
+            };
+            let mut sent = Vec::with_capacity(64);
+            if codec::encode(&brief, &mut sent).is_ok() {
+                let members = bytes.get(used..).unwrap_or_default();
+                if members != NO_MEMBERS {
+                    sent.extend_from_slice(members);
+                }
+                self.sends.push_back((to, sent));
+            }
+        }
     }
 
     fn submit_after(&mut self, timer: Timer<Entry>, after: Duration) {
@@ -228,6 +296,15 @@ struct WireHeader {
     message: WireMessage,
 }
 
+/// The header as it travels: the session that carries it knows both lives.
+#[derive(Serialize, Deserialize)]
+struct BriefHeader {
+    from_rejoin: u32,
+    refutations: u16,
+    to_rejoin: u32,
+    message: WireMessage,
+}
+
 #[derive(Serialize, Deserialize)]
 enum WireMessage {
     Ping(u8),
@@ -243,6 +320,36 @@ enum WireMessage {
     TurnUndead,
 }
 
+impl WireMessage {
+    fn into_foca(self) -> Message<Entry> {
+        match self {
+            Self::Ping(n) => Message::Ping(n),
+            Self::Ack(n) => Message::Ack(n),
+            Self::PingReq(target, probe_number) => Message::PingReq {
+                target,
+                probe_number,
+            },
+            Self::IndirectPing(origin, probe_number) => Message::IndirectPing {
+                origin,
+                probe_number,
+            },
+            Self::IndirectAck(target, probe_number) => Message::IndirectAck {
+                target,
+                probe_number,
+            },
+            Self::ForwardedAck(origin, probe_number) => Message::ForwardedAck {
+                origin,
+                probe_number,
+            },
+            Self::Announce => Message::Announce,
+            Self::Feed => Message::Feed,
+            Self::Gossip => Message::Gossip,
+            Self::Broadcast => Message::Broadcast,
+            Self::TurnUndead => Message::TurnUndead,
+        }
+    }
+}
+
 #[derive(Serialize, Deserialize)]
 struct WireMember {
     entry: Entry,
@@ -250,7 +357,7 @@ struct WireMember {
     state: u8,
 }
 
-impl foca::Codec<Entry> for EntryCodec {
+impl Codec<Entry> for EntryCodec {
     type Error = EntryError;
 
     fn encode_header(
@@ -301,36 +408,11 @@ impl foca::Codec<Entry> for EntryCodec {
 
     fn decode_header(&mut self, buf: impl Buf) -> Result<Header<Entry>, EntryError> {
         let header: WireHeader = take(buf)?;
-        let message = match header.message {
-            WireMessage::Ping(n) => Message::Ping(n),
-            WireMessage::Ack(n) => Message::Ack(n),
-            WireMessage::PingReq(target, probe_number) => Message::PingReq {
-                target,
-                probe_number,
-            },
-            WireMessage::IndirectPing(origin, probe_number) => Message::IndirectPing {
-                origin,
-                probe_number,
-            },
-            WireMessage::IndirectAck(target, probe_number) => Message::IndirectAck {
-                target,
-                probe_number,
-            },
-            WireMessage::ForwardedAck(origin, probe_number) => Message::ForwardedAck {
-                origin,
-                probe_number,
-            },
-            WireMessage::Announce => Message::Announce,
-            WireMessage::Feed => Message::Feed,
-            WireMessage::Gossip => Message::Gossip,
-            WireMessage::Broadcast => Message::Broadcast,
-            WireMessage::TurnUndead => Message::TurnUndead,
-        };
         Ok(Header {
             src: header.from,
             src_incarnation: header.refutations,
             dst: header.to,
-            message,
+            message: header.message.into_foca(),
         })
     }
 
@@ -404,7 +486,7 @@ impl fmt::Debug for Membership {
 
 #[cfg(test)]
 mod tests {
-    use foca::{Codec, Identity};
+    use foca::Identity;
 
     use super::*;
 
@@ -433,7 +515,10 @@ mod tests {
             message: Message::Ping(3),
         };
         EntryCodec.encode_header(&header, &mut bytes).unwrap();
-        assert!(bytes.len() <= 80, "{} bytes", bytes.len());
+        let mut effects = Effects::default();
+        effects.send_to(entry(2), &bytes);
+        let (_, sent) = effects.sends.pop_front().unwrap();
+        assert!(sent.len() <= 5, "{} bytes", sent.len());
         let read = EntryCodec.decode_header(bytes.as_slice()).unwrap();
         assert_eq!(read, header);
         assert_eq!(read.src.contact, header.src.contact);
@@ -444,15 +529,41 @@ mod tests {
         let (mut a, mut b) = (Membership::new(entry(1), 1), Membership::new(entry(2), 2));
         a.join(entry(2), Time(0));
         while let Some((_, bytes)) = a.poll_send() {
-            assert!(b.handle_datagram(&bytes, Time(1)));
+            assert!(b.handle_datagram(&entry(1), &bytes, Time(1)));
         }
         assert_eq!(a.poll_rumour(), Some(Rumour::Up(entry(2))));
         assert_eq!(b.poll_rumour(), Some(Rumour::Up(entry(1))));
         b.leave(Time(2));
         while let Some((_, bytes)) = b.poll_send() {
-            a.handle_datagram(&bytes, Time(3));
+            a.handle_datagram(&entry(2), &bytes, Time(3));
         }
         assert_eq!(a.poll_rumour(), Some(Rumour::Down(entry(2))));
+    }
+
+    #[test]
+    fn who_is_heard_is_not_probed_and_not_suspected() {
+        for heard in [true, false] {
+            let (mut a, mut b) = (Membership::new(entry(1), 1), Membership::new(entry(2), 2));
+            a.join(entry(2), Time(0));
+            let mut late = 0;
+            for ms in 1..20_000 {
+                let now = Time(ms * 1_000_000);
+                a.handle_timeout(now);
+                while let Some((to, bytes)) = a.poll_send() {
+                    // News go all the same, and are answered.
+                    if heard && !a.answer(&to, &bytes, now) {
+                        late += usize::from(ms > 12_000);
+                        b.handle_datagram(&entry(1), &bytes, now);
+                    }
+                }
+                while let Some((_, bytes)) = b.poll_send().filter(|_| heard) {
+                    a.handle_datagram(&entry(2), &bytes, now);
+                }
+            }
+            let rumours: Vec<_> = std::iter::from_fn(|| a.poll_rumour()).collect();
+            assert_eq!(rumours.contains(&Rumour::Down(entry(2))), !heard);
+            assert_eq!(late, 0);
+        }
     }
 
     #[test]

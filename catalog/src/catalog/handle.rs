@@ -148,7 +148,9 @@ impl Catalog {
         let out = &mut self.out;
         match message {
             Message::Swim(bytes) => {
-                if !self.membership.handle_datagram(&bytes, now) {
+                let from = self.hosts.get(host).filter(|host| host.tag == tag);
+                let from = from.map(|host| host.entry.clone());
+                if !from.is_some_and(|from| self.membership.handle_datagram(&from, &bytes, now)) {
                     self.counters.membership_refused += 1;
                 }
             }
