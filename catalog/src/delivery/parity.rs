@@ -275,6 +275,16 @@ mod tests {
     }
 
     #[test]
+    fn a_short_end_that_comes_first_does_not_hide_the_length_of_parities() {
+        let payload = vec![7; 150];
+        let transfer = Transfer::new(meta(), payload.clone(), 100, Time(0));
+        let (mut transfer, mut reassembly) = (transfer.protect(1), Reassembly::new(10_000));
+        let (_, step) = carry(&mut transfer, &mut reassembly, |at| at == 0);
+        let whole = step.and_then(|step| step.whole);
+        assert_eq!(whole, Some((meta(), payload)));
+    }
+
+    #[test]
     fn what_parities_do_not_make_up_for_is_asked_for_late_and_answered_later() {
         let transfer = Transfer::new(meta(), sample(), 100, Time(0));
         let (mut transfer, mut reassembly) = (transfer.protect(2), Reassembly::new(10_000));

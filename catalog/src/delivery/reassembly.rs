@@ -66,7 +66,7 @@ struct Partial {
     ranges: Vec<(usize, usize)>,
     /// When the last fragment came.
     last: Time,
-    /// Longest fragment: all but the last have its length.
+    /// Longest fragment but the last: all others have its length. 0 until one of them or a parity came.
     step: usize,
     /// The parities that came, by their numbers, of those that there are.
     parities: BTreeMap<u8, Vec<u8>>,
@@ -395,8 +395,10 @@ impl Partial {
         if !self.parities.is_empty() && payload.len() > self.step {
             return Added::Contradiction;
         }
-        self.step = self.step.max(payload.len());
         let end = start + payload.len();
+        if end < total {
+            self.step = self.step.max(payload.len());
+        }
         let next = self.ranges.partition_point(|(_, e)| *e <= start);
         match self.ranges.get(next) {
             Some((s, e)) if *s <= start && end <= *e => return Added::Part,
