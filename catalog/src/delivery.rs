@@ -37,6 +37,7 @@ mod reassembly;
 mod receiver;
 mod reception;
 mod sender;
+mod stream;
 mod transfer;
 
 pub use books::{Books, SentBooks, SourceBooks};

@@ -19,12 +19,7 @@ fn a_reader_of_every_sample_is_told_exactly_what_the_source_let_go_and_what_was_
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 1);
-    robot.write(0);
-    reader.open_readers_as("robot1/imu", 1, EVERY);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(1, EVERY);
     // 8 Mbit/s into a link of 2 Mbit/s that loses one in ten, from a ring of 8.
     let link = Profile::parse("lan --rate \"2 Mbit/s\" --loss 10%").unwrap();
     site.lab.host("base").set_link(&link).unwrap();
@@ -63,16 +58,11 @@ fn a_reader_of_every_sample_is_told_what_its_contract_kept_back() {
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 1);
-    robot.write(0);
     let asked = Asked {
         max_age_ms: Some(200),
         ..EVERY
     };
-    reader.open_readers_as("robot1/imu", 1, asked);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(1, asked);
     for block in 0..5 {
         let first = 1 + 20 * block;
         robot.ask(&Order::Write {
@@ -102,12 +92,7 @@ fn a_partition_costs_a_reader_of_every_sample_what_the_ring_let_go_and_nothing_e
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 1);
-    robot.write(0);
-    reader.open_readers_as("robot1/imu", 1, EVERY);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(1, EVERY);
     site.lab.host("base").cut().unwrap();
     site.wait_state("robot1", "base", "unreachable");
     let written = |first, count| Order::Write {
@@ -139,12 +124,7 @@ fn books_that_were_tampered_with_are_named_by_item_and_hop() {
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 2);
-    robot.write(0);
-    reader.open_readers("robot1/imu", 2);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(2, Asked::default());
     robot.write(1);
     reader.read(1, PATIENCE);
     let (_, mut rows) = settled(&site, "base");

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use ddx_rig::lab::{self, Counters, Lab, Process};
 use serde_json::Value;
 
-use crate::program::Program;
+use crate::program::{Asked, Program};
 
 /// UDP port of every daemon's samples: all that a host sends leaves from it.
 pub(crate) const DATA_PORT: u16 = 7450;
@@ -83,6 +83,18 @@ impl Site {
     /// Starts a program in a host.
     pub(crate) fn program(&self, host: &str) -> Program {
         Program::start(self.lab.host(host))
+    }
+
+    /// Starts a writer of `robot1/imu/0` and up in `robot1` and a reader of all of them in `base`, which has the first
+    /// value, 0, of each.
+    #[track_caller]
+    pub(crate) fn imu(&self, items: usize, asked: Asked) -> (Program, Program) {
+        let (mut robot, mut reader) = (self.program("robot1"), self.program("base"));
+        robot.open_writers("robot1/imu", items);
+        robot.write(0);
+        reader.open_readers_as("robot1/imu", items, asked);
+        reader.read(0, PATIENCE);
+        (robot, reader)
     }
 
     /// Runs `ddx --json` in a host and returns the objects that it prints.

@@ -74,12 +74,7 @@ fn why_names_a_link_that_is_too_slow_or_loses_and_a_reader_that_is() {
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 1);
-    robot.write(0);
-    reader.open_readers("robot1/imu", 1);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(1, Asked::default());
     robot.tell(&write_on(1_000));
     reader.tell_read(u64::MAX, PATIENCE * 6);
     let host = site.lab.host("base");
@@ -231,12 +226,7 @@ fn why_walks_every_step_when_asked() {
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
-    let mut robot = site.program("robot1");
-    let mut reader = site.program("base");
-    robot.open_writers("robot1/imu", 1);
-    robot.write(0);
-    reader.open_readers("robot1/imu", 1);
-    reader.read(0, PATIENCE);
+    let (mut robot, mut reader) = site.imu(1, Asked::default());
     robot.tell(&write_on(100));
     reader.tell_read(u64::MAX, PATIENCE * 6);
     // Loss that only one end sees is named at the other too.

@@ -5,16 +5,16 @@ use std::net::SocketAddr;
 use std::time::Duration;
 
 use ddx_wire::message::{Lacks, NackEntry, ReportEntry};
-use ddx_wire::sample::{MAX_SAMPLE_BYTES, SampleMeta};
+use ddx_wire::sample::SampleMeta;
 use ddx_wire::seal::{MAX_DATAGRAM_BYTES, Sealer};
-use ddx_wire::{Contract, Delivery, Epoch, Seq, StreamId, Tag, Time};
+use ddx_wire::{Delivery, Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::{SentBooks, SourceBooks};
 use super::deadlines::Deadlines;
 use super::path::{Offered, Path, PathLimits};
+use super::stream::Stream;
 use super::{
-    Due, Fetch, PathStatus, ReaderHost, Route, SenderEvent, TimerName, Transmit, Via, group_number,
-    key,
+    Due, Fetch, PathStatus, Route, SenderEvent, TimerName, Transmit, Via, group_number, key,
 };
 
 /// Limits of a [`Sender`].
@@ -78,34 +78,6 @@ pub struct StreamCounters {
     pub too_large: u64,
     /// Samples sent once more, in full or in part: growth beyond one for each new reader means loss.
     pub repeats: u64,
-}
-
-#[derive(Debug)]
-struct Stream {
-    contract: Contract,
-    /// Samples of the newest one's epoch that were offered to no path.
-    filtered: u64,
-    next_due: Time,
-    readers: Vec<Reader>,
-    destinations: Vec<SocketAddr>,
-    newest: Option<(Epoch, Seq)>,
-    expired: Option<(Epoch, Seq)>,
-    counters: StreamCounters,
-    books: SourceBooks,
-    /// Newest sample that was offered, whatever became of it.
-    offered: Option<(Epoch, Seq)>,
-}
-
-#[derive(Debug)]
-struct Reader {
-    host: ReaderHost,
-    sent: Option<(Epoch, Seq)>,
-    sent_at: Time,
-    held: Option<(Epoch, Seq)>,
-    repeats: u32,
-    repeat_asked_at: Option<Time>,
-    /// What it lacked when it last asked, and how often it asked for that.
-    asked: Option<((Epoch, Seq), u32)>,
 }
 
 impl<P: AsRef<[u8]> + Clone> Sender<P> {
@@ -659,146 +631,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
     }
 }
 
-/// How many samples come after the last one up to this; none if it is not newer. Before the first nothing is missed.
-fn ahead(last: Option<(Epoch, Seq)>, (epoch, Seq(seq)): (Epoch, Seq)) -> Option<u64> {
-    match last {
-        None => Some(1),
-        Some((before, _)) if before < epoch => Some(seq),
-        Some((before, Seq(last))) => seq.checked_sub(last).filter(|n| before == epoch && *n > 0),
-    }
-}
-
 fn enlist(ready: &mut VecDeque<SocketAddr>, blocked: &Deadlines<SocketAddr>, to: SocketAddr) {
     if !blocked.contains(&to) && !ready.contains(&to) {
         ready.push_back(to);
-    }
-}
-
-impl Stream {
-    fn reroute(&mut self, route: &Route, now: Time) {
-        self.contract = route.contract;
-        self.next_due = self.next_due.min(now + self.interval());
-        let mut old = std::mem::take(&mut self.readers);
-        for host in route.readers.iter().take(MAX_READERS) {
-            let kept = old.iter().position(|reader| reader.host.tag == host.tag);
-            let reader = kept.map_or_else(|| Reader::new(*host, now), |at| old.swap_remove(at));
-            self.readers.push(Reader {
-                host: *host,
-                ..reader
-            });
-        }
-        let destinations: BTreeSet<SocketAddr> = self
-            .readers
-            .iter()
-            .flat_map(|reader| reader.host.destinations())
-            .collect();
-        self.destinations = destinations.into_iter().collect();
-    }
-
-    /// Tells whether a sample fits the protocol and the contract, and counts one that does not.
-    fn admits(&mut self, meta: &SampleMeta, payload: &[u8], now: Time) -> bool {
-        if payload.len() > MAX_SAMPLE_BYTES {
-            self.counters.too_large += 1;
-            return false;
-        }
-        let max_age = self.contract.max_age_ms;
-        let max_age = max_age.map(|ms| Duration::from_millis(ms.into()));
-        if max_age.is_some_and(|age| now.since(meta.capture) > age) {
-            if self.expired < Some(key(meta)) {
-                self.expired = Some(key(meta));
-                self.counters.expired += 1;
-            }
-            return false;
-        }
-        true
-    }
-
-    /// Enters a sample that is offered, and those before it that were not.
-    fn account(&mut self, meta: &SampleMeta, payload: &[u8], admitted: bool) {
-        let Some(ahead) = ahead(self.offered, key(meta)) else {
-            return;
-        };
-        self.offered = Some(key(meta));
-        let books = &mut self.books;
-        books.expected = books.expected.saturating_add(ahead);
-        let missed = if self.contract.interval_ns() > 0 {
-            &mut books.rate_limited
-        } else {
-            &mut books.overwritten
-        };
-        *missed = missed.saturating_add(ahead.saturating_sub(1));
-        let fate = match admitted {
-            true => &mut books.delivered,
-            false if payload.len() > MAX_SAMPLE_BYTES => &mut books.too_large,
-            false => &mut books.expired,
-        };
-        *fate += 1;
-        books.bytes = books.bytes.saturating_add(payload.len() as u64);
-    }
-
-    /// Takes note of a sample that goes out, and completes it by how many of its epoch were offered to no path.
-    fn advance(&mut self, meta: &SampleMeta) -> SampleMeta {
-        let meta = self.complete(meta);
-        if Some(key(&meta)) > self.newest {
-            self.filtered = meta.filtered;
-            self.newest = Some(key(&meta));
-        }
-        meta
-    }
-
-    /// The same for one that goes out of turn, perhaps before the contract lets it go to all.
-    fn complete(&self, meta: &SampleMeta) -> SampleMeta {
-        let (epoch, Seq(seq)) = key(meta);
-        let filtered = match self.newest {
-            // What is left out of these is told one by one.
-            _ if self.contract.delivery != Delivery::Latest => 0,
-            Some((last, Seq(from))) if last == epoch => {
-                let skipped = seq.saturating_sub(from).saturating_sub(1);
-                self.filtered.saturating_add(skipped)
-            }
-            Some(_) | None => seq,
-        };
-        SampleMeta {
-            filtered: filtered.min(seq.saturating_sub(1)),
-            ..*meta
-        }
-    }
-
-    fn advance_due(&mut self, now: Time) {
-        let interval = self.interval();
-        // A source at just the contract's rate may be late once and on time again; more than one interval is no credit.
-        let base = if now.since(self.next_due) < interval {
-            self.next_due
-        } else {
-            now
-        };
-        self.next_due = base + interval;
-    }
-
-    fn interval(&self) -> Duration {
-        Duration::from_nanos(self.contract.interval_ns())
-    }
-
-    fn tags(&self) -> impl Iterator<Item = Tag> + '_ {
-        self.readers.iter().map(|reader| reader.host.tag)
-    }
-}
-
-impl Reader {
-    fn new(host: ReaderHost, now: Time) -> Self {
-        Self {
-            host,
-            sent: None,
-            sent_at: now,
-            held: None,
-            repeats: 0,
-            repeat_asked_at: None,
-            asked: None,
-        }
-    }
-
-    fn is_behind(&self) -> bool {
-        self.held < self.sent
     }
 }
 
@@ -834,7 +669,5 @@ const BATCH_SEGMENTS: usize = 64;
 const DATAGRAM_BYTES_MIN: usize = 256;
 /// Requests of one reader for one sample that are answered by its group.
 const GROUP_REPAIRS: u32 = 2;
-/// Reading hosts of one stream.
-const MAX_READERS: usize = 1_024;
 /// Path numbers below are those of groups.
 pub(super) const FIRST_UNICAST: u16 = 32;
