@@ -303,6 +303,24 @@ mod tests {
     }
 
     #[test]
+    fn requests_wait_while_parities_may_make_up_for_them() {
+        let transfer = Transfer::new(meta(), sample(), 100, Time(0));
+        let mut transfer = transfer.protect(1);
+        for _ in 0..10 {
+            transfer.next_fragment(Time(0));
+        }
+        // The fragments left long ago; the parity, at the pace of others, not yet.
+        let late = Time(0) + 3 * RTT;
+        transfer.ask(200, 100, RTT, late);
+        assert!(!transfer.repairs());
+        transfer.next_fragment(late);
+        transfer.ask(200, 100, RTT, late + RTT / 2);
+        assert!(!transfer.repairs());
+        transfer.ask(200, 100, RTT, late + RTT);
+        assert!(transfer.repairs());
+    }
+
+    #[test]
     fn parities_are_kept_within_the_budget() {
         let transfer = Transfer::new(meta(), sample(), 100, Time(0));
         let (mut transfer, mut reassembly) = (transfer.protect(9), Reassembly::new(995 + 250));
