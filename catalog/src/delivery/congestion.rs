@@ -2,8 +2,11 @@
 //!
 //! What piles up shows as growth of the time on the way over its recent least value. Loss alone does not slow a path
 //! down, because radio loses without being full; only loss that comes on top of what the path always loses does. The
-//! rate follows what arrives when the path is full, and grows while the sender has more to send than it lets through.
+//! rate follows what arrives when the path is full, and grows while the sender has more to send than it lets through:
+//! at most once in the time that its effect takes to be seen, fast up to what the path was last seen to carry, slowly
+//! there, and fast again where nothing piles up far beyond.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use ddx_wire::Time;
@@ -17,15 +20,26 @@ pub(super) struct Congestion {
     loss: f64,
     /// Newest share of datagrams lost.
     loss_now: f64,
-    /// Share of some hundred datagrams lost.
+    /// Share of some hundred datagrams lost while the path was not full.
     loss_mean: f64,
     /// Newest growth of the time on the way.
     queue: Duration,
-    /// Reports in a row without a sign of a full path.
-    calm: u32,
-    /// Whether the path was ever full: before, the rate is a guess.
-    was_full: bool,
+    /// The newest reports, enough to tell a rate, and whether what they say is lost was lost on a path that was not full.
+    arrived: VecDeque<(Progress, bool)>,
+    /// What the path carried when it was last full; none before, when the rate is a guess.
+    ceiling: Option<f64>,
+    /// Steps in a row beyond the ceiling without a sign of a full path.
+    beyond: u32,
+    /// Whether the rate held the sender back since it last grew.
+    limited: bool,
     slowed_at: Time,
+    /// When that has taken effect.
+    slowed_until: Time,
+    /// Number of the newest datagram that had been sent then.
+    slowed_number: u32,
+    /// What had piled up then.
+    slowed_queue: Duration,
+    grown_at: Time,
     /// The rate before nothing was heard any more.
     before_silence: Option<f64>,
 }
@@ -41,12 +55,18 @@ pub(crate) struct Progress {
     pub(crate) missing: u32,
     /// Bytes that arrived.
     pub(super) bytes: u32,
+    /// Number of the newest datagram of the report before.
+    pub(super) from: u32,
 }
 
 /// One host that reports about a path, and what it said.
 #[derive(Debug)]
 pub(super) struct Reporter {
     last: ReportEntry,
+    /// How long the fastest datagram of the newest report and the report took together, without what the report waited.
+    round_trip: Option<Duration>,
+    /// What left before this has come, or never will.
+    pub(super) seen: Option<Time>,
     /// The first time on the way that it told: others are compared with it, since its clock has a zero of its own.
     zero: u32,
     least: Least,
@@ -68,9 +88,15 @@ impl Congestion {
             loss_now: 0.0,
             loss_mean: 0.0,
             queue: Duration::ZERO,
-            calm: 0,
-            was_full: false,
+            arrived: VecDeque::new(),
+            ceiling: None,
+            beyond: 0,
+            limited: false,
             slowed_at: now,
+            slowed_until: now,
+            slowed_number: 0,
+            slowed_queue: Duration::ZERO,
+            grown_at: now,
             before_silence: None,
         }
     }
@@ -101,13 +127,15 @@ impl Congestion {
         permille(self.loss_mean)
     }
 
-    /// Takes in a report. `limited` tells whether the rate held the sender back since the one before.
+    /// Takes in a report. `limited` tells whether the rate held the sender back since the one before, and `round_trip` how
+    /// long it takes now until what is sent is reported, with what has piled up; `sent` is the number of the newest datagram.
     pub(super) fn handle_report(
         &mut self,
         progress: &Progress,
         queue: Duration,
         limited: bool,
         round_trip: Duration,
+        sent: u32,
         now: Time,
     ) {
         if let Some(rate) = self.before_silence.take() {
@@ -118,51 +146,140 @@ impl Congestion {
         let all = f64::from(progress.received) + f64::from(progress.missing);
         if all > 0.0 {
             self.loss_now = f64::from(progress.missing) / all;
+        }
+        if self.tells_loss(progress) {
             self.loss_mean += (self.loss_now - self.loss_mean) * all / (all + MEAN_DATAGRAMS);
         }
-        let arrived = f64::from(progress.bytes) / progress.span.as_secs_f64().max(0.001);
+        let (arrived, lost, datagrams) = self.of_late(progress);
         let capacity = arrived / (1.0 - self.loss.min(0.7));
+        self.limited |= limited;
 
-        let full = self.queue >= QUEUE_FULL;
-        let drops = self.loss_now > self.loss + LOSS_STEP;
-        if full || drops {
-            self.calm = 0;
-            if now >= self.slowed_at + round_trip.max(progress.span) {
-                self.slowed_at = now;
-                self.was_full |= full;
-                let share = if self.queue >= 2 * QUEUE_FULL {
-                    0.7
-                } else {
-                    0.85
-                };
-                self.bytes_per_second = if full {
-                    (capacity * share).min(self.bytes_per_second * 0.95)
-                } else {
-                    // A full path with a short queue, or one that has begun to lose: if slowing down does not help, it
-                    // is the latter.
-                    self.loss += (self.loss_now - self.loss) / 2.0;
-                    self.bytes_per_second * 0.85
-                };
+        let chance = (self.loss * (1.0 - self.loss) / datagrams).sqrt();
+        let enough = datagrams >= f64::from(ARRIVED_DATAGRAMS);
+        let drops = enough && lost > self.loss + LOSS_STEP + chance;
+        let seen_after = (progress.span / 2).max(round_trip);
+        if self.queue >= QUEUE_FULL {
+            self.beyond = 0;
+            if now >= self.slowed_until && self.was_sent_since(progress) {
+                self.slow_down(capacity);
+                self.slowed(sent, seen_after, now);
             }
+        } else if drops {
+            self.beyond = 0;
+            // A full path with a short queue, or one that has begun to lose: if slowing down does not help, it is the
+            // latter.
+            self.loss += (lost - self.loss) / 2.0;
+            self.bytes_per_second *= 0.85;
+            self.slowed(sent, seen_after, now);
         } else {
-            if all >= 4.0 {
-                self.loss += (self.loss_now - self.loss) / 8.0;
+            if self.queue > QUEUE_LOW * 3 / 2
+                && let Some(ceiling) = self.ceiling
+            {
+                // Something may pile up: no more than arrives, unless that is little because little was sent.
+                let most = capacity.max(0.98 * ceiling);
+                self.bytes_per_second = self.bytes_per_second.min(most);
             }
-            if self.queue <= QUEUE_LOW && limited {
-                self.calm = self.calm.saturating_add(1);
-                let growth = match self.calm {
-                    _ if !self.was_full => 1.5,
-                    0..=2 => 1.05,
-                    3..=6 => 1.15,
-                    _ => 1.3,
-                };
-                // What was never tried is not known to fit.
-                let tried = (4.0 * capacity).max(RATE_FIRST / 8.0);
-                self.bytes_per_second =
-                    (self.bytes_per_second * growth).min(self.bytes_per_second.max(tried));
+            let weight = (datagrams / f64::from(ARRIVED_DATAGRAMS)).min(1.0);
+            self.loss += (lost - self.loss) * weight / 8.0;
+            let since = self.grown_at.max(self.slowed_at);
+            if self.queue <= QUEUE_LOW && self.limited && now >= since + seen_after {
+                (self.grown_at, self.limited) = (now, false);
+                self.grow(capacity, round_trip);
             }
         }
         self.bytes_per_second = self.bytes_per_second.clamp(RATE_MIN, RATE_MAX);
+    }
+
+    fn slowed(&mut self, sent: u32, seen_after: Duration, now: Time) {
+        self.slowed_number = sent;
+        (self.slowed_at, self.slowed_queue) = (now, self.queue);
+        self.slowed_until = now + seen_after;
+        for (_, counts) in &mut self.arrived {
+            *counts = false;
+        }
+    }
+
+    /// The path is full, and carries this.
+    fn slow_down(&mut self, capacity: f64) {
+        // So that what has piled up is gone in a third of a second; what drains already needs time, not less.
+        let share = 1.0 - self.queue.as_secs_f64() / DRAIN.as_secs_f64();
+        let share = share.max(0.6);
+        let least = if self.queue < self.slowed_queue {
+            1.0
+        } else {
+            0.95
+        };
+        if self.ceiling.is_none() {
+            // What was lost before the first sign of a full path was lost because it was full.
+            (self.loss, self.loss_mean) = (0.0, 0.0);
+        }
+        // One measurement is a rough one.
+        self.ceiling = Some(match self.ceiling {
+            Some(ceiling) if (0.5..2.0).contains(&(capacity / ceiling)) => {
+                (ceiling + capacity) / 2.0
+            }
+            _ => capacity,
+        });
+        self.bytes_per_second = (capacity * share).min(self.bytes_per_second * least);
+    }
+
+    /// Nothing piles up, and more could be sent.
+    fn grow(&mut self, capacity: f64, round_trip: Duration) {
+        let rate = self.bytes_per_second;
+        // What was never tried is not known to fit.
+        let tried = rate.max(4.0 * capacity).max(RATE_FIRST / 8.0);
+        let grown = match self.ceiling {
+            None => rate * 2.0,
+            Some(ceiling) if rate < 0.9 * ceiling => (rate * 1.5).min(0.95 * ceiling),
+            Some(ceiling) if rate < BEYOND * ceiling => {
+                // What piles up before that is seen stays small.
+                let round_trip = round_trip.as_secs_f64().max(0.001);
+                let share = (STEP.as_secs_f64() / round_trip).clamp(0.02, 0.05);
+                // So that of several paths that share a link the slow ones catch up.
+                (rate * (1.0 + share)).max(rate + STEP_BYTES / round_trip)
+            }
+            Some(_) => {
+                self.beyond = self.beyond.saturating_add(1);
+                rate * if self.beyond > 2 { 1.5 } else { 1.15 }
+            }
+        };
+        self.bytes_per_second = grown.min(tried);
+    }
+
+    /// Whether what a report says is lost was lost on a path that was not full: what a full queue dropped shows when a later
+    /// datagram has passed it.
+    fn tells_loss(&self, progress: &Progress) -> bool {
+        self.queue <= QUEUE_LOW && self.was_sent_since(progress)
+    }
+
+    /// Whether a report is about datagrams that left after the rate was last lowered.
+    fn was_sent_since(&self, progress: &Progress) -> bool {
+        progress.from.wrapping_sub(self.slowed_number) < 1 << 31
+    }
+
+    /// Bytes per second that arrived of late, over enough datagrams that the jitter of one does not count; and the share
+    /// of datagrams that were lost while the path was not full, and of how many.
+    fn of_late(&mut self, progress: &Progress) -> (f64, f64, f64) {
+        let counts = self.tells_loss(progress);
+        self.arrived.push_back((*progress, counts));
+        let enough = |arrived: &VecDeque<(Progress, bool)>| {
+            let later = || arrived.iter().skip(1).map(|(progress, _)| progress);
+            later().map(|p| p.received).sum::<u32>() >= ARRIVED_DATAGRAMS
+                && later().map(|p| p.span).sum::<Duration>() >= ARRIVED_SPAN
+        };
+        while self.arrived.len() > 1
+            && (enough(&self.arrived) || self.arrived.len() > ARRIVED_REPORTS)
+        {
+            self.arrived.pop_front();
+        }
+        let bytes: f64 = self.arrived.iter().map(|(p, _)| f64::from(p.bytes)).sum();
+        let span: Duration = self.arrived.iter().map(|(p, _)| p.span).sum();
+        let counted = || self.arrived.iter().filter(|(_, counts)| *counts);
+        let received: f64 = counted().map(|(p, _)| f64::from(p.received)).sum();
+        let missing: f64 = counted().map(|(p, _)| f64::from(p.missing)).sum();
+        let datagrams = (received + missing).max(1.0);
+        let rate = bytes / span.as_secs_f64().max(0.001);
+        (rate, missing / datagrams, datagrams)
     }
 
     /// Notes that much was sent and nothing was heard for a while: the path may be cut, or hopelessly full.
@@ -171,8 +288,8 @@ impl Congestion {
         let silent = now >= since.max(self.slowed_at) + SILENCE.max(3 * round_trip);
         if silent {
             self.before_silence.get_or_insert(self.bytes_per_second);
-            self.slowed_at = now;
-            self.calm = 0;
+            (self.slowed_at, self.slowed_until) = (now, now);
+            self.beyond = 0;
             let least = RATE_SILENT.min(self.bytes_per_second);
             self.bytes_per_second = (self.bytes_per_second / 2.0).max(least);
         }
@@ -196,6 +313,7 @@ impl Progress {
             received,
             missing: passed.saturating_sub(received),
             bytes: next.bytes.wrapping_sub(last.bytes),
+            from: last.highest,
         })
     }
 }
@@ -206,9 +324,16 @@ impl Reporter {
         least.update(0, now);
         Self {
             zero: first.delay_us,
+            round_trip: round_trip(&first, now),
+            seen: None,
             last: first,
             least,
         }
+    }
+
+    /// How long it takes until a datagram is reported, with what has piled up on the way.
+    pub(super) fn round_trip(&self) -> Option<Duration> {
+        self.round_trip
     }
 
     /// Takes in a report: what it adds to the one before, and how much longer datagrams took than the fastest of late.
@@ -219,11 +344,22 @@ impl Reporter {
     ) -> Option<(Progress, Duration)> {
         let progress = Progress::between(&self.last, report);
         self.last = *report;
+        self.round_trip = round_trip(report, now);
         let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
         let least = self.least.update(delay, now);
         let queue = u64::try_from(delay.saturating_sub(least)).unwrap_or(0);
         Some((progress?, Duration::from_micros(queue)))
     }
+}
+
+/// The receiver's clock is in both times of a report, and falls out.
+fn round_trip(report: &ReportEntry, now: Time) -> Option<Duration> {
+    let now_us = u32::try_from((now.0 / 1_000) & u64::from(u32::MAX)).unwrap_or_default();
+    let micros = now_us
+        .wrapping_sub(report.at_us)
+        .wrapping_add(report.delay_us);
+    let round_trip = Duration::from_micros(micros.into());
+    (round_trip <= ROUND_TRIP_MAX).then_some(round_trip)
 }
 
 impl Least {
@@ -264,8 +400,24 @@ const RATE_MAX: f64 = 5e9;
 const QUEUE_FULL: Duration = Duration::from_millis(30);
 /// Growth below which the rate may grow.
 const QUEUE_LOW: Duration = Duration::from_millis(15);
+/// How long what has piled up may take to drain.
+const DRAIN: Duration = Duration::from_millis(300);
 /// Loss beyond the usual that means a full path whose queue is too short to show.
 const LOSS_STEP: f64 = 0.15;
+/// Least growth in a round trip: a part of a datagram.
+const STEP_BYTES: f64 = 60.0;
+/// What the growth of a round trip lets pile up in the next.
+const STEP: Duration = Duration::from_micros(2_500);
+/// Multiple of what the path carried when it was full, above which it is another path.
+const BEYOND: f64 = 1.25;
+/// Datagrams that tell a rate, whatever the jitter of each.
+const ARRIVED_DATAGRAMS: u32 = 8;
+/// Least time that tells a rate.
+const ARRIVED_SPAN: Duration = Duration::from_millis(40);
+/// Reports that are remembered for it at most.
+const ARRIVED_REPORTS: usize = 16;
+/// What takes longer is an error of a peer.
+const ROUND_TRIP_MAX: Duration = Duration::from_secs(10);
 /// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
 const WINDOW: Duration = Duration::from_secs(10);
 /// Nothing heard for so long, though much was sent.
@@ -307,9 +459,11 @@ mod tests {
                 received: packets(arrived).max(1),
                 missing: packets(sent * link.loss + full),
                 bytes: whole(arrived),
+                from: u32::MAX / 4,
             };
             let queue = Duration::from_secs_f64(delay);
-            congestion.handle_report(&progress, queue, true, Duration::from_millis(20), now);
+            let round_trip = Duration::from_millis(20) + queue;
+            congestion.handle_report(&progress, queue, true, round_trip, 0, now);
         }
         delivered / span.as_secs_f64()
     }
@@ -389,9 +543,10 @@ mod tests {
             received: 4,
             missing: 0,
             bytes: 4_000,
+            from: 0,
         };
         let now = Time(10_000_000_000);
-        congestion.handle_report(&progress, Duration::ZERO, false, Duration::ZERO, now);
+        congestion.handle_report(&progress, Duration::ZERO, false, Duration::ZERO, 0, now);
         assert_eq!(congestion.rate(), 6_250_000);
     }
 

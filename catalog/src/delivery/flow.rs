@@ -14,7 +14,7 @@ use super::{Want, key};
 pub(super) struct Flow<P> {
     pub(super) contract: Contract,
     /// Turns are taken in the order of this: bytes sent, divided by the weight.
-    pub(super) turn: u64,
+    turn: u64,
     progress: Progress,
     /// What became of the samples since the flow was opened.
     books: SentBooks,
@@ -69,6 +69,24 @@ impl<P: AsRef<[u8]>> Flow<P> {
         self.contract.priority == Priority::Command
     }
 
+    /// When it is its turn: commands are before all others.
+    pub(super) fn turn(&self) -> u64 {
+        if self.is_command() { 0 } else { self.turn }
+    }
+
+    /// It pays for bytes: the more weight, the less. `now` is the turn that was taken last, where those begin who were idle;
+    /// returns the one that is taken now.
+    pub(super) fn charge(&mut self, bytes: usize, now: u64) -> u64 {
+        if self.is_command() {
+            return now;
+        }
+        let taken = self.turn.max(now);
+        let bytes = u64::try_from(bytes).unwrap_or(u64::MAX);
+        let weight = u64::from(self.contract.priority.weight().max(1));
+        self.turn = taken.saturating_add(bytes.saturating_mul(WEIGHT_UNIT) / weight);
+        taken
+    }
+
     /// Whether something must be read from the store.
     pub(super) fn wants_fetch(&self) -> bool {
         let busy = self.is_under_way();
@@ -77,6 +95,12 @@ impl<P: AsRef<[u8]>> Flow<P> {
 
     pub(super) fn is_under_way(&self) -> bool {
         self.transfers.iter().any(Transfer::is_under_way)
+    }
+
+    /// Whether more is on its way to readers that have not got the newest yet.
+    pub(super) fn is_busy(&self) -> bool {
+        let in_turn = self.waits.is_some() || !self.gaps.is_empty() || self.repairs();
+        self.is_under_way() || (self.is_every() && in_turn)
     }
 
     pub(super) fn repairs(&self) -> bool {
@@ -286,6 +310,8 @@ pub(super) struct Filled {
     pub(super) parts: Vec<(u32, u32)>,
 }
 
+/// Keeps the quotient of [`Flow::charge`] exact for all weights.
+const WEIGHT_UNIT: u64 = 16;
 /// How long the samples of a burst wait their turn before the newest alone counts.
 const BURST: Duration = Duration::from_millis(20);
 /// Gaps of one stream on one path that wait for repair.

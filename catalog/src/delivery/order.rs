@@ -181,9 +181,17 @@ impl Order {
         self.ask_at
     }
 
-    /// What to ask for at its deadline; the flag tells that it was asked for long enough.
+    /// The first sample that is missing, if later ones are here.
+    pub(super) fn missing(&self) -> Option<(Epoch, Seq)> {
+        let next = self.next.filter(|_| !self.held.is_empty())?;
+        Some((self.epoch, next))
+    }
+
+    /// What to ask for at its deadline; the flag tells that it was asked for long enough. What `comes` already is waited
+    /// for.
     pub(super) fn due(
         &mut self,
+        comes: bool,
         round_trip: Duration,
         wait: Duration,
         now: Time,
@@ -193,7 +201,7 @@ impl Order {
         if gaps.is_empty() {
             return (gaps, false);
         }
-        if now.since(self.gap_since) >= GIVE_UP.max(16 * round_trip) {
+        if !comes && now.since(self.gap_since) >= GIVE_UP.max(16 * round_trip) {
             return (Vec::new(), true);
         }
         let backoff = 1 << self.asked.min(3);
@@ -307,7 +315,7 @@ mod tests {
         }
         assert_eq!(drain(&mut order), [5]);
         assert_eq!(order.newest(), Some((Epoch(1), Seq(9))));
-        let (asks, over) = order.due(RTT, WAIT, order.deadline().unwrap());
+        let (asks, over) = order.due(false, RTT, WAIT, order.deadline().unwrap());
         let firsts: Vec<_> = asks.iter().map(|ask| (ask.first.0, ask.count)).collect();
         assert_eq!((firsts, over), (vec![(6, 1), (8, 1)], false));
         insert(&mut order, 1, 8);
@@ -322,7 +330,7 @@ mod tests {
         let mut order = Order::new(true);
         insert(&mut order, 1, 4);
         assert_eq!(drain(&mut order), []);
-        let (asks, _) = order.due(RTT, WAIT, order.deadline().unwrap());
+        let (asks, _) = order.due(false, RTT, WAIT, order.deadline().unwrap());
         assert_eq!((asks[0].first.0, asks[0].count), (1, 3));
         order.gone(Epoch(1), (Seq(1), Seq(2)), Why::Overwritten, WAIT, Time(0));
         insert(&mut order, 1, 3);
@@ -350,7 +358,7 @@ mod tests {
         insert(&mut order, 1, 6);
         insert(&mut order, 1, 10);
         assert_eq!(drain(&mut order), []);
-        let (asks, _) = order.due(RTT, WAIT, order.deadline().unwrap());
+        let (asks, _) = order.due(false, RTT, WAIT, order.deadline().unwrap());
         let asked: Vec<_> = asks.iter().map(|ask| (ask.first.0, ask.count)).collect();
         assert_eq!(asked, [(2, 1)]);
         insert(&mut order, 1, 2);
@@ -366,7 +374,7 @@ mod tests {
         assert_eq!(drain(&mut order), [1]);
         let mut asked = 0;
         while let Some(at) = order.deadline() {
-            let (asks, over) = order.due(RTT, WAIT, at);
+            let (asks, over) = order.due(false, RTT, WAIT, at);
             asked += asks.len();
             if over {
                 assert!(at.since(Time(0)) >= GIVE_UP);

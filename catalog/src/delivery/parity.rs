@@ -211,10 +211,14 @@ mod tests {
     use ddx_wire::{Seq, StreamId, Tag, Time};
 
     use super::super::reassembly::{Due, Reassembly, Rules, Step};
-    use super::super::transfer::Transfer;
+    use super::super::transfer::{Flight, Transfer};
     use super::*;
 
     const RTT: Duration = Duration::from_millis(100);
+    const FLIGHT: Flight = Flight {
+        time: RTT,
+        seen: None,
+    };
 
     fn meta() -> SampleMeta {
         SampleMeta {
@@ -249,6 +253,7 @@ mod tests {
             };
             let rules = Rules {
                 depth: 2,
+                in_order: false,
                 round_trip: RTT,
                 patience: Duration::ZERO,
             };
@@ -296,9 +301,9 @@ mod tests {
         assert_eq!(at, Time(0) + RTT / 2);
         let (_, due) = reassembly.due(at).unwrap();
         assert_eq!(due, Due::Ask(vec![(200, 200)]));
-        transfer.ask(200, 200, RTT, at);
+        transfer.ask(200, 200, FLIGHT, at);
         assert!(!transfer.repairs());
-        transfer.ask(200, 200, RTT, Time(0) + RTT);
+        transfer.ask(200, 200, FLIGHT, Time(0) + RTT);
         assert!(transfer.repairs());
     }
 
@@ -311,12 +316,12 @@ mod tests {
         }
         // The fragments left long ago; the parity, at the pace of others, not yet.
         let late = Time(0) + 3 * RTT;
-        transfer.ask(200, 100, RTT, late);
+        transfer.ask(200, 100, FLIGHT, late);
         assert!(!transfer.repairs());
         transfer.next_fragment(late);
-        transfer.ask(200, 100, RTT, late + RTT / 2);
+        transfer.ask(200, 100, FLIGHT, late + RTT / 2);
         assert!(!transfer.repairs());
-        transfer.ask(200, 100, RTT, late + RTT);
+        transfer.ask(200, 100, FLIGHT, late + RTT);
         assert!(transfer.repairs());
     }
 

@@ -3,7 +3,7 @@
 //! Next to nothing is queued here: what the path cannot take now stays in the store, and is read again when it can, the
 //! newest first. Streams take turns by weight, counted in bytes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ use super::pace::{Pace, batch_bytes};
 use super::parity;
 use super::queue::{DATAGRAM_OVERHEAD, Limit, Queue};
 use super::sender::FIRST_UNICAST;
-use super::transfer::Transfer;
+use super::transfer::{Flight, Transfer};
 use super::{Fetch, PathStatus, Transmit, Want};
 
 /// A destination of datagrams.
@@ -47,6 +47,8 @@ pub(super) struct Path<P> {
     turn: u64,
     round_trip: Duration,
     reporters: BTreeMap<Tag, Reporter>,
+    /// Number of the newest datagram at some times, the latest last.
+    departures: VecDeque<(u32, Time)>,
     unreported_bytes: usize,
     unreported_since: Time,
     probe_at: Time,
@@ -93,6 +95,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             turn: 0,
             round_trip: Duration::from_millis(50),
             reporters: BTreeMap::new(),
+            departures: VecDeque::new(),
             unreported_bytes: 0,
             unreported_since: now,
             probe_at: now,
@@ -131,8 +134,10 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
     /// Opens a flow, or changes its contract.
     pub(super) fn open(&mut self, stream: StreamId, contract: Contract) {
         let turn = self.turn;
+        self.forget_turns(stream);
         let flow = self.flows.entry(stream);
         flow.or_insert_with(|| Flow::new(contract, turn)).contract = contract;
+        self.take_turns(stream);
     }
 
     /// How far a stream has got here.
@@ -225,8 +230,9 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             queue.len() >= room(rate) && !queue.has_company(RECORD_BYTES + len, self.datagram_bytes)
         };
         if full {
+            // Behind a large one that is on its way it waits for the end of that.
             flow.waits = Some(now);
-            self.hungry.insert((flow.turn, stream));
+            self.take_turns(stream);
             return Offered::Waits;
         }
         self.admit(stream, meta, payload, None, now)
@@ -345,9 +351,12 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         let Some(flow) = self.flows.get_mut(&stream) else {
             return;
         };
+        let is_busy = flow.is_busy();
         match newest.and_then(|at| flow.transfer(at)) {
             Some(transfer) if transfer.is_under_way() => {}
             Some(transfer) => transfer.ask_last(),
+            // It comes in its turn, and out of turn only behind what is on its way.
+            None if is_busy => {}
             None => flow.urgent = true,
         }
         self.take_turns(stream);
@@ -374,12 +383,12 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         now: Time,
     ) -> bool {
         self.forget_turns(stream);
-        let round_trip = self.round_trip;
+        let flight = self.flight();
         let mut answered = true;
         if let Some(flow) = self.flows.get_mut(&stream) {
             if let Some(transfer) = flow.transfer(at) {
                 for (offset, len) in parts {
-                    transfer.ask(*offset, *len, round_trip, now);
+                    transfer.ask(*offset, *len, flight, now);
                 }
             } else if flow.is_every() || is_newest {
                 // It went another way, or long ago.
@@ -390,6 +399,43 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         }
         self.take_turns(stream);
         answered
+    }
+
+    /// What may still be on its way: it left less than until it is reported ago, with the time that its own and one more
+    /// datagram take, and no later one was reported by all.
+    fn flight(&self) -> Flight {
+        let bytes = u64::try_from(2 * self.datagram_bytes).unwrap_or(u64::MAX);
+        let micros = bytes.saturating_mul(1_000_000) / self.congestion.rate().max(1);
+        let reported = self.reporters.values().filter_map(Reporter::round_trip);
+        let reported = reported.max().unwrap_or(self.round_trip);
+        let seen = self.reporters.values().map(|reporter| reporter.seen).min();
+        Flight {
+            // What piled up may have doubled since.
+            time: reported + self.congestion.queue() + Duration::from_micros(micros),
+            seen: seen.flatten().map(|seen| seen - REORDERING),
+        }
+    }
+
+    /// Notes when a batch leaves.
+    fn note_departure(&mut self, now: Time) {
+        if self
+            .departures
+            .back()
+            .is_some_and(|(_, at)| now < *at + DEPARTURES_PAUSE)
+        {
+            return;
+        }
+        if self.departures.len() == DEPARTURES {
+            self.departures.pop_front();
+        }
+        self.departures.push_back((self.datagrams, now));
+    }
+
+    /// When the last of the noted datagrams left that is not later than this one.
+    fn departed(&self, number: u32) -> Option<Time> {
+        let departures = self.departures.iter().rev();
+        let mut earlier = departures.skip_while(|(at, _)| number.wrapping_sub(*at) >= 1 << 31);
+        earlier.next().map(|(_, at)| *at)
     }
 
     /// Every reader here holds a sample.
@@ -406,14 +452,18 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             self.datagram_bytes = self.datagram_bytes.max(longest);
         }
         self.unreported_bytes = 0;
+        let departed = self.departed(report.highest);
         let Some(reporter) = self.reporters.get_mut(&from) else {
             self.reporters.insert(from, Reporter::new(*report, now));
             return;
         };
+        reporter.seen = reporter.seen.max(departed);
         if let Some((progress, queue)) = reporter.handle_report(report, now) {
             let limited = self.pace.take_limited();
+            let round_trip = reporter.round_trip().unwrap_or(self.round_trip + queue);
+            let sent = self.datagrams;
             self.congestion
-                .handle_report(&progress, queue, limited, self.round_trip, now);
+                .handle_report(&progress, queue, limited, round_trip, sent, now);
         }
     }
 
@@ -502,6 +552,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         if first == 0 {
             return None;
         }
+        self.note_departure(now);
         self.pace.spend(out.len(), rate, now);
         if self.unreported_bytes == 0 {
             self.unreported_since = now;
@@ -580,8 +631,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
                     self.left.push((stream, meta.epoch, meta.seq));
                 }
             }
-            self.turn = flow.turn;
-            flow.turn += charge(cut_bytes, flow.contract);
+            self.turn = flow.charge(cut_bytes, self.turn);
         }
         self.take_turns(stream);
     }
@@ -611,7 +661,6 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         let meta = SampleMeta { filtered, ..*meta };
         let bytes = payload.as_ref();
         flow.count_bytes(bytes.len());
-        flow.turn = flow.turn.max(self.turn);
         let offered = if large {
             let step = self.datagram_bytes - DATAGRAM_OVERHEAD - FRAGMENT_RECORD_BYTES;
             let parities = parity::Link {
@@ -637,8 +686,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
                 payload: bytes,
             };
             let lane = lane_of(flow.is_command(), again.is_some());
-            self.turn = flow.turn;
-            flow.turn += charge(record.encoded_len(), flow.contract);
+            self.turn = flow.charge(record.encoded_len(), self.turn);
             self.lanes[lane].push(&record, self.datagram_bytes);
             Offered::Goes
         };
@@ -700,7 +748,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
 
     fn forget_turns(&mut self, stream: StreamId) {
         if let Some(flow) = self.flows.get(&stream) {
-            let entry = (flow.turn, stream);
+            let entry = (flow.turn(), stream);
             self.hungry.remove(&entry);
             self.sending.remove(&entry);
             self.repairing.remove(&entry);
@@ -711,7 +759,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
     fn take_turns(&mut self, stream: StreamId) {
         self.forget_turns(stream);
         if let Some(flow) = self.flows.get(&stream) {
-            let entry = (flow.turn, stream);
+            let entry = (flow.turn(), stream);
             if flow.wants_fetch() {
                 self.hungry.insert(entry);
             }
@@ -723,12 +771,6 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             }
         }
     }
-}
-
-/// What a flow pays for bytes: the more weight, the less.
-fn charge(bytes: usize, contract: Contract) -> u64 {
-    let bytes = u64::try_from(bytes).unwrap_or(u64::MAX);
-    bytes.saturating_mul(WEIGHT_UNIT) / u64::from(contract.priority.weight().max(1))
 }
 
 fn lane_of(command: bool, again: bool) -> usize {
@@ -752,5 +794,8 @@ const ETHERNET_BYTES: usize = 1_472;
 const PROBE_PAUSE: Duration = Duration::from_secs(10);
 /// So much may be sent without a report before their absence means something: receivers report each 2 KiB.
 const SILENT_BYTES: usize = 16 << 10;
-/// Keeps the quotient of [`charge`] exact for all weights.
-const WEIGHT_UNIT: u64 = 16;
+/// Least time between two noted departures, and how many are remembered: the longest round trip lies between.
+const DEPARTURES_PAUSE: Duration = Duration::from_millis(1);
+const DEPARTURES: usize = 1_024;
+/// What left later may come so much earlier.
+const REORDERING: Duration = Duration::from_millis(5);

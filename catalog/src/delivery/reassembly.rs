@@ -34,6 +34,8 @@ pub(super) struct Place {
 pub(super) struct Rules {
     /// Incomplete samples of the stream that may be held.
     pub(super) depth: usize,
+    /// Whether each sample is wanted: the oldest incomplete one comes first, and what has no room now is asked for later.
+    pub(super) in_order: bool,
     /// How long an answer of the sender takes.
     pub(super) round_trip: Duration,
     /// How long to wait before asking, so that not all receivers of a group ask at once.
@@ -102,12 +104,16 @@ impl Reassembly {
             let held = self.of(tag, record.stream).map(|(place, _)| *place);
             let held: Vec<Place> = held.collect();
             if held.len() >= rules.depth {
-                match held.first() {
+                let given_up = match rules.in_order {
+                    true => held.last().filter(|newest| **newest > place),
                     // The newest are worth more.
-                    Some(oldest) if *oldest < place => {
-                        failed = self.remove(*oldest).map(|p| (p.meta, Failure::Expired));
+                    false => held.first().filter(|oldest| **oldest < place),
+                };
+                match given_up {
+                    Some(other) => {
+                        failed = self.remove(*other).map(|p| (p.meta, Failure::Expired));
                     }
-                    Some(_) | None => return Step::failed(record.meta, Failure::Expired),
+                    None => return Step::failed(record.meta, Failure::Expired),
                 }
             }
             let total = usize::try_from(fragment.total).unwrap_or(usize::MAX);
@@ -480,6 +486,7 @@ mod tests {
         };
         let rules = Rules {
             depth: 1,
+            in_order: false,
             round_trip: Duration::from_millis(10),
             patience: Duration::ZERO,
         };

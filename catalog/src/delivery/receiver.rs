@@ -461,6 +461,7 @@ impl Receiver {
         };
         let rules = Rules {
             depth,
+            in_order: stream.order.is_some(),
             round_trip,
             patience,
         };
@@ -645,10 +646,20 @@ impl Receiver {
 
     fn ask_samples(&mut self, tag: Tag, id: StreamId, now: Time) {
         let round_trip = self.round_trip_of(tag);
+        let missing = self.order(tag, id).and_then(|order| order.missing());
+        let comes = missing.is_some_and(|(epoch, seq)| {
+            let stream = id;
+            self.reassembly.has(&Place {
+                tag,
+                stream,
+                epoch,
+                seq,
+            })
+        });
         let Some(order) = self.order(tag, id) else {
             return;
         };
-        let (asks, over) = order.due(round_trip, REORDERING, now);
+        let (asks, over) = order.due(comes, round_trip, REORDERING, now);
         if over {
             order.skip_gap();
         }

@@ -19,8 +19,12 @@ pub(super) struct Reception {
 #[derive(Debug)]
 struct Path {
     report: ReportEntry,
-    /// Least time on the way since the last report.
+    /// Least time on the way since the last report, of long datagrams and of others.
     least: Option<u32>,
+    least_short: Option<u32>,
+    /// Length of long ones, and when one last came: on a slow link the length takes time, so that only like is compared.
+    long: usize,
+    long_at: Time,
     reported: Time,
     last: Time,
     /// Since the last report.
@@ -53,6 +57,9 @@ impl Reception {
                 longest: 0,
             },
             least: None,
+            least_short: None,
+            long: len,
+            long_at: now,
             reported: now,
             last: now,
             datagrams: 0,
@@ -70,7 +77,19 @@ impl Reception {
         report.bytes = report.bytes.wrapping_add(bytes);
         report.longest = report.longest.max(u16::try_from(len).unwrap_or(u16::MAX));
         let delay = micros(now).wrapping_sub(preamble.sent_us);
-        let least = path.least.get_or_insert(delay);
+        if len >= path.long || now.since(path.long_at) >= LONG {
+            path.long = len;
+        }
+        let is_long = 8 * len >= 7 * path.long;
+        if is_long {
+            path.long_at = now;
+        }
+        let least = if is_long {
+            &mut path.least
+        } else {
+            &mut path.least_short
+        };
+        let least = least.get_or_insert(delay);
         if delay.wrapping_sub(*least).cast_signed() < 0 {
             *least = delay;
         }
@@ -96,7 +115,11 @@ impl Reception {
         let path = self.paths.get_mut(&at)?;
         path.reported = now;
         (path.datagrams, path.bytes) = (0, 0);
-        path.report.delay_us = path.least.take().unwrap_or(path.report.delay_us);
+        let before = path.report.delay_us;
+        let short = path.least_short.take();
+        // What takes a short one longer than a long one before waited.
+        let grown = short.filter(|delay| delay.wrapping_sub(before).cast_signed() > 0);
+        path.report.delay_us = path.least.take().or(grown).unwrap_or(before);
         path.report.at_us = micros(now);
         Some((at.0, path.report))
     }
@@ -131,6 +154,8 @@ const PAUSE: Duration = Duration::from_millis(50);
 const PAUSE_MANY: Duration = Duration::from_millis(20);
 /// A pause that is reported as over.
 const SILENCE: Duration = Duration::from_millis(400);
+/// How long the length of long datagrams is remembered.
+const LONG: Duration = Duration::from_secs(10);
 /// Datagrams that are much.
 const MANY: u32 = 16;
 

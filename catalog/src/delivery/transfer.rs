@@ -27,6 +27,14 @@ pub(super) struct Transfer<P> {
     parities: Parities,
 }
 
+/// What may still be on its way: it left less than a time ago, and none that left later was seen.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Flight {
+    pub(super) time: Duration,
+    /// What left before this has come, or never will.
+    pub(super) seen: Option<Time>,
+}
+
 /// Fragments that stand in for others.
 #[derive(Debug, Default)]
 struct Parities {
@@ -69,7 +77,7 @@ impl<P: AsRef<[u8]>> Transfer<P> {
         if !parts.is_empty() {
             self.next = self.left.len();
             for (offset, len) in parts {
-                self.ask(*offset, *len, Duration::ZERO, now);
+                self.ask(*offset, *len, Flight::NONE, now);
             }
         }
         self
@@ -114,8 +122,8 @@ impl<P: AsRef<[u8]>> Transfer<P> {
         self.fragment(index, now)
     }
 
-    /// Queues what is missing of a part, except what is on its way: never sent yet, or within the last `round_trip`.
-    pub(super) fn ask(&mut self, offset: u32, len: u32, round_trip: Duration, now: Time) {
+    /// Queues what is missing of a part, except what is on its way: never sent yet, or in flight.
+    pub(super) fn ask(&mut self, offset: u32, len: u32, flight: Flight, now: Time) {
         let (Ok(offset), Ok(len)) = (usize::try_from(offset), usize::try_from(len)) else {
             return;
         };
@@ -124,19 +132,19 @@ impl<P: AsRef<[u8]>> Transfer<P> {
             .saturating_add(len)
             .div_ceil(self.step)
             .min(self.next);
-        if self.parities.count > 0
-            && (self.is_under_way() || now.since(self.parities.left) < round_trip)
+        if self.parities.count > 0 && (self.is_under_way() || flight.holds(self.parities.left, now))
         {
             // Perhaps they make up for it.
             return;
         }
-        let round_trip = u32::try_from(round_trip.as_millis()).unwrap_or(u32::MAX);
-        let elapsed = self.elapsed(now);
+        let time = u32::try_from(flight.time.as_millis()).unwrap_or(u32::MAX);
+        let landed = self.elapsed(now).saturating_sub(time);
+        let seen = flight.seen.map_or(0, |seen| self.elapsed(seen));
         for index in first..end {
             let Some(left) = self.left.get_mut(index) else {
                 return;
             };
-            if *left == u32::MAX || (*left != 0 && elapsed.saturating_sub(*left) < round_trip) {
+            if *left == u32::MAX || (*left > landed && *left >= seen) {
                 continue;
             }
             // Marked as on its way, so that it is not queued twice.
@@ -197,11 +205,27 @@ impl<P: AsRef<[u8]>> Transfer<P> {
     }
 }
 
+impl Flight {
+    /// Nothing is.
+    const NONE: Self = Self {
+        time: Duration::ZERO,
+        seen: None,
+    };
+
+    fn holds(self, left: Time, now: Time) -> bool {
+        now.since(left) < self.time && self.seen.is_none_or(|seen| left >= seen)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     const RTT: Duration = Duration::from_millis(10);
+    const FLIGHT: Flight = Flight {
+        time: RTT,
+        seen: None,
+    };
 
     fn offsets(transfer: &mut Transfer<Vec<u8>>, now: Time) -> Vec<u32> {
         std::iter::from_fn(|| transfer.next_repair(now).map(|(f, _)| f.offset)).collect()
@@ -217,21 +241,35 @@ mod tests {
             (0, 10, &[0, 1, 2, 3][..])
         );
         // What was never sent needs no repair.
-        transfer.ask(0, 10, RTT, Time(0) + RTT);
+        transfer.ask(0, 10, FLIGHT, Time(0) + RTT);
         assert_eq!(offsets(&mut transfer, Time(0) + RTT), [0]);
         transfer.next_fragment(Time(0) + RTT);
         let (last, bytes) = transfer.next_fragment(Time(0) + RTT).unwrap();
         assert_eq!((last.offset, bytes), (8, &[8, 9][..]));
         assert!(!transfer.is_under_way());
         // All of them left less than a round trip ago.
-        transfer.ask(0, 10, RTT, Time(0) + RTT + RTT / 2);
+        transfer.ask(0, 10, FLIGHT, Time(0) + RTT + RTT / 2);
         assert!(!transfer.repairs());
         let later = Time(0) + 3 * RTT;
-        transfer.ask(5, 1, RTT, later);
-        transfer.ask(4, 6, RTT, later);
+        transfer.ask(5, 1, FLIGHT, later);
+        transfer.ask(4, 6, FLIGHT, later);
         assert_eq!(offsets(&mut transfer, later), [4, 8]);
-        transfer.ask(0, u32::MAX, RTT, later);
-        transfer.ask(u32::MAX, u32::MAX, RTT, later);
+        transfer.ask(0, u32::MAX, FLIGHT, later);
+        transfer.ask(u32::MAX, u32::MAX, FLIGHT, later);
         assert_eq!(offsets(&mut transfer, later), [0]);
+    }
+
+    #[test]
+    fn what_a_later_one_overtook_is_not_waited_for() {
+        let mut transfer = Transfer::new(SampleMeta::default(), vec![0; 8], 4, Time(0));
+        transfer.next_fragment(Time(0));
+        transfer.next_fragment(Time(0) + RTT);
+        let now = Time(0) + RTT * 3 / 2;
+        let flight = Flight {
+            time: 9 * RTT,
+            seen: Some(Time(0) + RTT / 2),
+        };
+        transfer.ask(0, 8, flight, now);
+        assert_eq!(offsets(&mut transfer, now), [0]);
     }
 }
