@@ -107,6 +107,16 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         self.number
     }
 
+    /// Number of the newest datagram.
+    pub(super) fn datagrams(&self) -> u32 {
+        self.datagrams
+    }
+
+    /// Goes on after the datagram of this number.
+    pub(super) fn count_from(&mut self, datagrams: u32) {
+        self.datagrams = datagrams;
+    }
+
     pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
         self.round_trip = round_trip;
     }

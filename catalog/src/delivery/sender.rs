@@ -42,6 +42,8 @@ pub struct Sender<P> {
     paths: BTreeMap<SocketAddr, Path<P>>,
     numbers: BTreeMap<u16, SocketAddr>,
     last_number: u16,
+    /// Datagrams sent so far to groups that are not in use now: their receivers count on.
+    left_off: BTreeMap<u16, u32>,
     /// Paths that have something to send, in turn.
     ready: VecDeque<SocketAddr>,
     /// Paths that wait for their rate.
@@ -90,6 +92,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             paths: BTreeMap::new(),
             numbers: BTreeMap::new(),
             last_number: FIRST_UNICAST - 1,
+            left_off: BTreeMap::new(),
             ready: VecDeque::new(),
             blocked: Deadlines::new(),
             hungry: BTreeSet::new(),
@@ -452,6 +455,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             None => group_number(to).unwrap_or_else(|| self.unicast_number()),
         };
         self.numbers.insert(number, to);
+        let left_off = self.left_off.remove(&number).unwrap_or_default();
         self.paths.entry(to).or_insert_with(|| {
             let limits = PathLimits {
                 // Room for at least one payload byte of a fragment, whatever the configuration says.
@@ -460,6 +464,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
                 segments_max: self.config.segments_max.clamp(1, BATCH_SEGMENTS),
             };
             let mut path = Path::new(to, number, limits, self.now);
+            path.count_from(left_off);
             let readers = self.streams.values().flat_map(|stream| &stream.readers);
             let at = readers.filter(|reader| reader.host.addr == to);
             let known = at.filter_map(|reader| self.round_trips.get(&reader.host.tag));
@@ -618,6 +623,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             let kept = streams.is_some() || !path.is_unused();
             if !kept {
                 self.numbers.remove(&path.number());
+                if path.number() < FIRST_UNICAST {
+                    self.left_off.insert(path.number(), path.datagrams());
+                }
                 self.blocked.clear(*to);
                 self.hungry.remove(to);
             }

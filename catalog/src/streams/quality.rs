@@ -90,6 +90,10 @@ impl Quality {
 
     /// Whether a group that loses this share of so many datagrams loses more than unicast, and not by chance.
     fn is_worse(&self, share: f64, weight: f64) -> bool {
+        if share > LOSS_HOPELESS && weight >= WEIGHT_HOPELESS {
+            // Perhaps it fills the way of this host, which then loses by unicast too, but would not without it.
+            return true;
+        }
         let unicast = self.paths.iter().filter(|(path, _)| **path > GROUPS);
         let known = unicast.map(|(_, loss)| (loss.share, loss.weight));
         let best = known.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or_default();
@@ -127,6 +131,10 @@ const WEIGHT: f64 = 100.0;
 const WEIGHT_MIN: f64 = 12.0;
 /// A group that loses so much more than unicast is not used: what unicast costs more is less than what repairs would.
 const LOSS_MORE: f64 = 0.05;
+/// A group that loses so much is not used, whatever unicast loses: that finds the rate which this one host can take.
+const LOSS_HOPELESS: f64 = 0.5;
+/// Datagrams from which that is known.
+const WEIGHT_HOPELESS: f64 = 50.0;
 /// Standard deviations beyond which a difference is not taken for chance.
 const DEVIATIONS: f64 = 3.0;
 /// How long a group that failed is left alone at first.
