@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
+use ddx_rig::link::Profile;
 use ddx_rig::sim::{Link, Random, Setup, Sim};
 use ddx_wire::{Contract, ItemName};
 
@@ -24,6 +25,8 @@ struct Play {
     random: Random,
     sim: Sim,
     loss: f64,
+    /// What the slowest link carries, bits per second, where links are limited at all.
+    rate: Option<u64>,
     sources: Vec<Source>,
     ordinals: Vec<u32>,
     on: Vec<bool>,
@@ -104,10 +107,14 @@ impl Play {
                 Duration::from_micros(random.below(1_500))
             },
         };
+        let mut sim = Sim::new(setup);
+        let rate = (!calm && loss < 0.05 && random.chance(0.4))
+            .then(|| Self::limit_links(&mut sim, hosts, seed, &mut random));
         let mut play = Self {
             seed,
-            sim: Sim::new(setup),
+            sim,
             loss,
+            rate,
             sources: Vec::new(),
             ordinals: vec![1; hosts],
             on: vec![true; hosts],
@@ -142,11 +149,46 @@ impl Play {
         play
     }
 
+    /// Gives each host a link that is limited, or bursty, or both. Returns the rate of the slowest.
+    fn limit_links(sim: &mut Sim, hosts: usize, seed: u64, random: &mut Random) -> u64 {
+        let mut least = u64::MAX;
+        for host in 0..hosts {
+            let (mbit, profile) = random.pick(&[
+                (50, "wifi-good"),
+                (10, "wifi-bad --delay \"5 ms\" --jitter \"5 ms\""),
+                (50, "wifi-multicast-broken"),
+                (3, "lte --delay \"15 ms\""),
+                (5, "lan --rate \"5 Mbit/s\" --loss 10%"),
+                (2, "lan --rate \"2 Mbit/s\" --delay \"20 ms\""),
+            ]);
+            least = least.min(mbit * 1_000_000);
+            let profile = Profile::parse(&format!("{profile} --seed {seed}")).unwrap();
+            sim.set_profile(host, 0, &profile);
+        }
+        least
+    }
+
+    /// How long the newest of all that is read takes on the slowest link, of which a path that shares it with others has
+    /// an eighth at worst.
+    fn crossing(&self) -> Duration {
+        let Some(rate) = self.rate else {
+            return Duration::ZERO;
+        };
+        let wanted = (0..self.on.len()).flat_map(|reader| self.sim.host(reader).wanted.keys());
+        let lens = wanted.filter_map(|name| {
+            let source = self.sources.iter().find(|source| source.name == *name);
+            source.map(|source| source.len)
+        });
+        let bits = u64::try_from(lens.sum::<usize>() * 8).unwrap();
+        millis(8 * bits * 1_000 / rate)
+    }
+
     fn describe(&self) -> String {
         format!(
-            "{} hosts, loss {}, calm {}, at {:?}",
+            "{} hosts, loss {}, rate {:?}, calm {}, at {:?}",
             self.on.len(),
             self.loss,
+            self.rate,
             self.calm,
             self.sim.now()
         )
@@ -262,10 +304,10 @@ impl Play {
         }
     }
 
-    /// One second after now, without writes, every reader holds the newest value.
+    /// One second after now, without writes, and the time that the links take, every reader holds the newest value.
     fn ends_with_the_newest(&mut self, when: &str) -> Result<(), String> {
         let start = self.sim.now();
-        self.sim.run_for(secs(1));
+        self.sim.run_for(secs(1) + self.crossing());
         for reader in 0..self.on.len() {
             for (name, contract) in &self.sim.host(reader).wanted {
                 let mut sources = self.sources.iter();
@@ -306,7 +348,7 @@ impl Play {
             }
         }
         // Without loss a goodbye arrives; else it is said three times, and the lease ends what nobody heard.
-        let limit = if self.loss == 0.0 {
+        let limit = if self.loss == 0.0 && self.rate.is_none() {
             millis(100)
         } else {
             millis(3_400)

@@ -6,6 +6,7 @@
 //! | `delivery.rs` | the last value arrives; nothing is sent twice, too often, to nobody or too large |
 //! | `links.rs` | the same over each link profile, and a profile does what it says |
 //! | `paths.rs` | samples flow on when an address, a link or a network of several goes |
+//! | `matrix.rs` | samples of all sizes over each link profile, in a time that the link explains, with exact books |
 //! | `chance.rs` | the same under whatever a seed thinks up, with each sample judged |
 //!
 //! A failure prints its seed and the line that replays it. `DDX_SEED=n` runs that seed alone, `DDX_SEEDS=n` runs as many
@@ -20,6 +21,7 @@ mod chance;
 mod delivery;
 mod directory;
 mod links;
+mod matrix;
 mod paths;
 mod seeds;
 

@@ -212,6 +212,12 @@ impl Line {
         self.counters
     }
 
+    /// Returns how long a frame that is pushed now waits for the transmitter.
+    #[must_use]
+    pub fn backlog(&self, now: Duration) -> Duration {
+        Duration::from_nanos(self.free_at.saturating_sub(nanos(now)))
+    }
+
     /// Changes what it does to frames from now on; the sequence of chances goes on.
     pub fn configure(&mut self, config: Config) {
         self.config = config;

@@ -290,6 +290,11 @@ impl Sim {
         self.net.books(index, network)
     }
 
+    /// How long a datagram that arrives now at a host's link to a network waits for the transmitter.
+    pub fn backlog(&self, index: usize, network: usize) -> Duration {
+        self.net.backlog(index, network, self.now())
+    }
+
     /// Opens a writer of an item under a host's prefix: a new item, or a new epoch of one that is there.
     pub fn announce(&mut self, index: usize, rest: &str) -> ItemName {
         let name = ItemName::parse(&format!("./{rest}"), &self.hosts[index].name)
@@ -363,12 +368,16 @@ impl Sim {
 
     fn run_to(&mut self, end: u64, holds: impl Fn(&Self) -> bool) -> bool {
         let mut next_check = self.now;
+        // Nothing changes between two events, but the next one may be far.
+        let mut changed = true;
         loop {
-            if self.now >= next_check {
+            let next = self.queue.peek().map_or(u64::MAX, |next| next.0.0);
+            if changed && next > next_check {
+                self.now = self.now.max(next_check.min(end));
                 if holds(self) {
                     return true;
                 }
-                next_check = self.now + 1_000_000;
+                (changed, next_check) = (false, self.now + 1_000_000);
             }
             let next = self.queue.peek_mut();
             let next = next.filter(|next| next.0.0 <= end);
@@ -378,6 +387,9 @@ impl Sim {
                 self.now = end;
                 return holds(self);
             };
+            if !changed {
+                (changed, next_check) = (true, next_check.max(at));
+            }
             self.now = self.now.max(at);
             match action {
                 Action::Wake(index) => self.wake(index),

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_catalog::delivery::{ReceiverEvent, Route};
+use ddx_catalog::delivery::{Books, PathStatus, ReceiverEvent, Route};
 use ddx_catalog::{Catalog, Config, Dest, Event};
 use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::{DomainKey, Opener, Purpose, Sealer};
@@ -242,6 +242,18 @@ impl Host {
     pub fn link_lost(&self) -> u64 {
         let lost = |data: &Data| data.rx.books().map(|books| books.link_lost).sum();
         self.data.as_ref().map_or(0, lost)
+    }
+
+    /// What its sender knows of each destination.
+    pub fn paths(&self) -> Vec<PathStatus> {
+        let paths = |data: &Data| data.tx.sender.paths().collect();
+        self.data.as_ref().map(paths).unwrap_or_default()
+    }
+
+    /// The books of each stream that it reads.
+    pub fn books(&self) -> Vec<Books> {
+        let books = |data: &Data| data.rx.books().collect();
+        self.data.as_ref().map(books).unwrap_or_default()
     }
 
     pub(super) fn open_writer(&mut self, name: &ItemName, now: Moment) {

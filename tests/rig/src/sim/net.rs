@@ -124,6 +124,10 @@ impl Net {
         }
     }
 
+    pub(super) fn backlog(&self, index: usize, network: usize, now: Duration) -> Duration {
+        self.ends[index][network].down.backlog(now)
+    }
+
     pub(super) fn cut(&mut self, group_of: impl Fn(usize) -> usize) {
         for (index, group) in self.groups.iter_mut().enumerate() {
             *group = group_of(index);
