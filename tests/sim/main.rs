@@ -7,6 +7,7 @@
 //! | `links.rs` | the same over each link profile, and a profile does what it says |
 //! | `paths.rs` | samples flow on when an address, a link or a network of several goes |
 //! | `matrix.rs` | samples of all sizes over each link profile, in a time that the link explains, with exact books |
+//! | `share.rs` | what shares a link: unlike priorities, commands beside bulk, unlike viewers, a group that loses |
 //! | `chance.rs` | the same under whatever a seed thinks up, with each sample judged |
 //!
 //! A failure prints its seed and the line that replays it. `DDX_SEED=n` runs that seed alone, `DDX_SEEDS=n` runs as many
@@ -24,6 +25,7 @@ mod links;
 mod matrix;
 mod paths;
 mod seeds;
+mod share;
 
 use std::time::Duration;
 
