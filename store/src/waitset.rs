@@ -27,6 +27,8 @@ pub struct WaitSet {
     members: BTreeMap<WaitKey, Member>,
     by_bit: BTreeMap<u16, Vec<WaitKey>>,
     marked: BTreeSet<WaitKey>,
+    /// Readers that were handed out since the last wait: a read may have bound them to a segment.
+    lent: BTreeSet<WaitKey>,
     looked: Instant,
     last: u64,
 }
@@ -54,6 +56,7 @@ impl WaitSet {
             members: BTreeMap::new(),
             by_bit: BTreeMap::new(),
             marked: BTreeSet::new(),
+            lent: BTreeSet::new(),
             looked: Instant::now(),
             last: 0,
         }
@@ -70,7 +73,9 @@ impl WaitSet {
 
     /// The reader of that key.
     pub fn reader(&mut self, key: WaitKey) -> Option<&mut RawReader> {
-        self.members.get_mut(&key).map(|member| &mut member.reader)
+        let member = self.members.get_mut(&key)?;
+        self.lent.insert(key);
+        Some(&mut member.reader)
     }
 
     /// Takes a reader out.
@@ -78,6 +83,7 @@ impl WaitSet {
         let member = self.members.remove(&key)?;
         member.reader.set_waiting(false);
         self.marked.remove(&key);
+        self.lent.remove(&key);
         if let Some((bit, _)) = member.bell {
             self.unlist(bit, key);
         }
@@ -116,6 +122,9 @@ impl WaitSet {
     /// enters the kernel for a `timeout` of zero or while readers are marked. May return nothing before the time.
     pub fn wait(&mut self, timeout: Duration, rung: &mut Vec<WaitKey>) {
         rung.clear();
+        for key in std::mem::take(&mut self.lent) {
+            self.listen(key);
+        }
         let (bells, client) = self.connection.bell();
         // Before the bell is armed: writers that ring a busy thread have no need to enter the kernel.
         let woken = self.take(&bells, client, rung);
@@ -213,10 +222,59 @@ impl Waker {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    use std::thread;
+
     use ddx_wire::HostName;
 
     use super::*;
+    use crate::ReaderOptions;
     use crate::server::Config;
+
+    #[test]
+    fn a_reader_that_was_opened_before_its_item_is_heard_from_the_first_sample_on() {
+        let config = Config::new(HostName::parse("robot1").unwrap());
+        let (store, mut server) = Store::embedded(config).unwrap();
+        let (stop, handle) = (AtomicBool::new(false), server.handle());
+        let took = thread::scope(|scope| {
+            scope.spawn(|| server.run(&stop));
+            let took: Duration = (0..10)
+                .map(|round| hear(&store, &format!("item{round}")))
+                .sum();
+            stop.store(true, Ordering::Relaxed);
+            handle.wake();
+            took
+        });
+        // Unheard, each would be found by the look at all, a slice later.
+        assert!(took < 5 * MAX_SLICE, "{took:?}");
+    }
+
+    /// How long a sample takes to a reader that has just become bound to its item by a read.
+    fn hear(store: &Store, name: &str) -> Duration {
+        let options = ReaderOptions::default();
+        let reader = store.raw_reader(name, None, options).unwrap();
+        let mut set = WaitSet::new(store);
+        let key = set.add(reader);
+        let mut writer = store.writer::<u64>(name).unwrap();
+        let mut payload = Vec::new();
+        let mut read = |set: &mut WaitSet| {
+            let reader = set.reader(key).unwrap();
+            reader.next_into(&mut payload, Duration::ZERO).unwrap()
+        };
+        writer.write(&1).unwrap();
+        while read(&mut set).is_none() {}
+        let mut rung = Vec::new();
+        // What is left of the opening is out of the way.
+        set.wait(Duration::from_millis(1), &mut rung);
+        let start = Instant::now();
+        thread::scope(|scope| {
+            scope.spawn(|| writer.write(&2).unwrap());
+            while read(&mut set).is_none() {
+                set.wait(Duration::from_secs(60), &mut rung);
+            }
+        });
+        start.elapsed()
+    }
 
     #[test]
     fn a_waker_that_comes_before_the_sleep_ends_it() {
