@@ -11,7 +11,7 @@ pub(crate) mod tx;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What the data sockets carried, for `@/counters`. Growth of the last three means loss.
+/// What the data sockets carried, for `@/counters`. Growth of the last four means loss.
 #[derive(Debug, Default)]
 pub(crate) struct Traffic {
     /// Datagrams sent.
@@ -28,6 +28,8 @@ pub(crate) struct Traffic {
     pub(crate) stale_samples: AtomicU64,
     /// Samples that a mirror's segment refused, such as one larger than the item's capacity.
     pub(crate) refused_samples: AtomicU64,
+    /// What the receiving thread wanted to have told a sender, while the control loop was far behind.
+    pub(crate) untold_notices: AtomicU64,
 }
 
 /// Adds to a counter that is only ever read to be shown.

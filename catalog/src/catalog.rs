@@ -497,6 +497,7 @@ impl Catalog {
             {
                 if self.waiting.len() >= WAITING_MAX {
                     self.waiting.pop_front();
+                    self.counters.over_limit = self.counters.over_limit.saturating_add(1);
                 }
                 self.waiting.push_back((tag, bytes));
             }

@@ -345,7 +345,9 @@ impl State {
                 ReceiverEvent::Nack(tag, nack) => Notice::Nack(tag, nack),
             };
             // A full queue costs one acknowledgement, which the next renewal makes good.
-            self.notices.send(notice).ok();
+            if self.notices.send(notice).is_err() {
+                count(&self.inbound.traffic.untold_notices, 1);
+            }
         }
         if now.since(self.shown) >= board::PERIOD {
             self.shown = now;

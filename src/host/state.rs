@@ -390,6 +390,10 @@ fn counters(network: &Network) -> Value {
         "data_unwanted_records".to_owned(),
         network.received().unwanted_records,
     );
+    add(
+        "data_refused_streams".to_owned(),
+        network.received().refused_streams,
+    );
     counters.into()
 }
 
@@ -398,7 +402,7 @@ fn refused(reason: Refused) -> String {
     format!("refused_{reason}").replace(' ', "_")
 }
 
-fn named(traffic: &Traffic) -> [(&'static str, &AtomicU64); 7] {
+fn named(traffic: &Traffic) -> [(&'static str, &AtomicU64); 8] {
     [
         ("sent_datagrams", &traffic.sent_datagrams),
         ("sent_bytes", &traffic.sent_bytes),
@@ -407,6 +411,7 @@ fn named(traffic: &Traffic) -> [(&'static str, &AtomicU64); 7] {
         ("unsent_datagrams", &traffic.unsent_datagrams),
         ("stale_samples", &traffic.stale_samples),
         ("refused_samples", &traffic.refused_samples),
+        ("untold_notices", &traffic.untold_notices),
     ]
 }
 

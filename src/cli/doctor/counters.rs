@@ -33,6 +33,14 @@ fn meaning(what: &str, domain: u16) -> Option<(&'static str, String)> {
             "samples that do not fit their item",
             "`ddx info NAME` shows its capacity and schema; restart its writer",
         ),
+        "untold_notices" => (
+            "acknowledgements and requests that were dropped because the daemon was far behind",
+            "`top -H` shows what takes the cores; fewer or slower items relieve the daemon",
+        ),
+        "refused_streams" => (
+            "streams of other hosts that were not taken in, because there are too many",
+            "catalog/PROTOCOL.md has the limit; `ddx ls` shows what is read here",
+        ),
         "stale_lives" => (
             "greetings of an earlier life of a host",
             "two machines with a copied disk share one identity: remove /var/lib/ddx on one of them and restart it",

@@ -421,6 +421,8 @@ fn each_counter_that_means_trouble_has_its_meaning() {
         "control_unsent_datagrams",
         "data_stale_samples",
         "data_refused_samples",
+        "data_untold_notices",
+        "data_refused_streams",
         "control_stale_lives",
         "control_over_limit",
         "control_membership_refused",
