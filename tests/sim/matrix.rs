@@ -163,10 +163,7 @@ fn newest(name: &str, len: usize) -> String {
         ms(usual),
         ms(times[count - 1]),
     );
-    assert!(
-        usual <= bounds.usual,
-        "{name} {len}: {times:?}, {bounds:?}"
-    );
+    assert!(usual <= bounds.usual, "{name} {len}: {times:?}, {bounds:?}");
     check(&play.sim).unwrap();
     line
 }
