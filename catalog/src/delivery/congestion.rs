@@ -70,6 +70,15 @@ pub(super) struct Reporter {
     /// The first time on the way that it told: others are compared with it, since its clock has a zero of its own.
     zero: u32,
     least: Least,
+    /// What its newest report came to, and when.
+    strain: Option<(Strain, Time)>,
+}
+
+/// How hard a path is for one reporter.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Strain {
+    queue: Duration,
+    loss: f64,
 }
 
 /// Least value of the last ten to twenty seconds.
@@ -145,7 +154,7 @@ impl Congestion {
         self.queue = queue;
         let all = f64::from(progress.received) + f64::from(progress.missing);
         if all > 0.0 {
-            self.loss_now = f64::from(progress.missing) / all;
+            self.loss_now = progress.loss();
         }
         if self.tells_loss(progress) {
             self.loss_mean += (self.loss_now - self.loss_mean) * all / (all + MEAN_DATAGRAMS);
@@ -298,6 +307,12 @@ impl Congestion {
 }
 
 impl Progress {
+    /// Share of datagrams that did not arrive.
+    fn loss(&self) -> f64 {
+        let all = f64::from(self.received) + f64::from(self.missing);
+        f64::from(self.missing) / all.max(1.0)
+    }
+
     /// What `next` adds to `last`, two reports of one reporter; `None` if it adds nothing.
     pub(crate) fn between(last: &ReportEntry, next: &ReportEntry) -> Option<Self> {
         let span = next.at_us.wrapping_sub(last.at_us);
@@ -328,6 +343,7 @@ impl Reporter {
             seen: None,
             last: first,
             least,
+            strain: None,
         }
     }
 
@@ -348,7 +364,24 @@ impl Reporter {
         let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
         let least = self.least.update(delay, now);
         let queue = u64::try_from(delay.saturating_sub(least)).unwrap_or(0);
-        Some((progress?, Duration::from_micros(queue)))
+        let (progress, queue) = (progress?, Duration::from_micros(queue));
+        let loss = progress.loss();
+        self.strain = Some((Strain { queue, loss }, now));
+        Some((progress, queue))
+    }
+
+    /// How hard the path is for it, if it said so of late.
+    pub(super) fn strain(&self, now: Time) -> Option<Strain> {
+        let (strain, at) = self.strain?;
+        (now.since(at) < STRAIN_LASTS).then_some(strain)
+    }
+}
+
+impl Strain {
+    /// Whether what slows the path down for one reporter is not seen by this other one: it lies behind the group.
+    pub(super) fn is_not_shared_by(&self, other: &Self) -> bool {
+        let is_strained = self.queue >= QUEUE_FULL || self.loss > other.loss + LOSS_STEP;
+        is_strained && other.queue <= QUEUE_LOW && other.loss <= self.loss
     }
 }
 
@@ -420,6 +453,8 @@ const ARRIVED_REPORTS: usize = 16;
 const ROUND_TRIP_MAX: Duration = Duration::from_secs(10);
 /// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
 const WINDOW: Duration = Duration::from_secs(10);
+/// Reports come every 50 ms while there is enough to report.
+const STRAIN_LASTS: Duration = Duration::from_millis(500);
 /// Nothing heard for so long, though much was sent.
 const SILENCE: Duration = Duration::from_millis(500);
 

@@ -469,12 +469,24 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         };
         reporter.seen = reporter.seen.max(departed);
         if let Some((progress, queue)) = reporter.handle_report(report, now) {
-            let limited = self.pace.take_limited();
             let round_trip = reporter.round_trip().unwrap_or(self.round_trip + queue);
+            if self.is_slow_for_one(from, now) {
+                return;
+            }
+            let limited = self.pace.take_limited();
             let sent = self.datagrams;
             self.congestion
                 .handle_report(&progress, queue, limited, round_trip, sent, now);
         }
+    }
+
+    /// Whether one member of a group is behind a slower link than another: it is to leave the group, which loses too much for
+    /// it, and not to slow the others down.
+    fn is_slow_for_one(&self, one: Tag, now: Time) -> bool {
+        let strain = self.reporters.get(&one).and_then(|r| r.strain(now));
+        let others = self.reporters.iter().filter(|(tag, _)| **tag != one);
+        let mut others = others.filter_map(|(_, reporter)| reporter.strain(now));
+        strain.is_some_and(|strain| others.any(|other| strain.is_not_shared_by(&other)))
     }
 
     /// Forgets the reports of readers that are gone.

@@ -404,6 +404,45 @@ fn two_readers_of_unlike_paths_do_not_disturb_one_another() {
 }
 
 #[test]
+fn a_member_behind_a_slower_link_does_not_slow_its_group_down() {
+    // What the second member tells: a queue that grows and loss; alone, and beside one that is well.
+    let rate_with = |others: &[u16]| {
+        let mut sender = sender(Via::Group(group()), 2);
+        let mut now = Time(0);
+        let mut numbers = 0;
+        for round in 1..=20_u32 {
+            now = now + 50 * MS;
+            sender.write(STREAM, &meta(1, u64::from(round)), &vec![0; 8], now);
+            drain(&mut sender);
+            numbers += 10;
+            let well = ReportEntry {
+                path: 4,
+                highest: numbers,
+                received: numbers,
+                bytes: numbers * 1_000,
+                delay_us: 500,
+                at_us: round * 50_000,
+                longest: 1_200,
+            };
+            let badly = ReportEntry {
+                received: numbers / 2,
+                bytes: numbers * 500,
+                delay_us: 500 + round.min(10) * 10_000,
+                ..well
+            };
+            for &other in others {
+                sender.handle_report(reader(other, Via::Unicast).tag, &well, now);
+            }
+            sender.handle_report(reader(1, Via::Unicast).tag, &badly, now);
+        }
+        let path = sender.paths().find(|path| path.to == group()).unwrap();
+        path.bytes_per_second
+    };
+    assert!(rate_with(&[]) < 1_000_000, "{}", rate_with(&[]));
+    assert!(rate_with(&[0]) >= 12_500_000, "{}", rate_with(&[0]));
+}
+
+#[test]
 fn every_sample_that_the_ring_holds_arrives_in_order() {
     let mut sender = Sender::new(SenderConfig::default(), data_sealer(), Time(0));
     let mut route = route(Via::Unicast, 1);
