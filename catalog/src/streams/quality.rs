@@ -40,6 +40,11 @@ impl Quality {
         if self.paths.len() >= PATHS && !self.paths.contains_key(&path) {
             return false;
         }
+        if !self.admits(path, now) {
+            // What was still on its way when the group was given up says nothing about the next trial.
+            self.paths.remove(&path);
+            return false;
+        }
         let loss = self.paths.entry(path).or_insert_with(|| Loss {
             last: *report,
             share: 0.0,
@@ -64,9 +69,6 @@ impl Quality {
             pause: PAUSE_FIRST / 2,
             losses: (0.0, 0.0),
         });
-        if shunned.until > now {
-            return false;
-        }
         // Each trial that fails makes the next one wait longer.
         let is_new = now.since(shunned.until) > 4 * shunned.pause + PAUSE_FIRST;
         shunned.pause = if is_new {
@@ -77,9 +79,7 @@ impl Quality {
         shunned.until = now + shunned.pause;
         shunned.losses = (share, unicast);
         // The next trial begins without a memory.
-        if let Some(loss) = self.paths.get_mut(&path) {
-            (loss.share, loss.weight) = (0.0, 0.0);
-        }
+        self.paths.remove(&path);
         true
     }
 
@@ -90,7 +90,7 @@ impl Quality {
 
     /// Whether a group that loses this share of so many datagrams loses more than unicast, and not by chance.
     fn is_worse(&self, share: f64, weight: f64) -> bool {
-        if share > LOSS_HOPELESS && weight >= WEIGHT_HOPELESS {
+        if share > LOSS_HOPELESS && weight >= WEIGHT {
             // Perhaps it fills the way of this host, which then loses by unicast too, but would not without it.
             return true;
         }
@@ -126,15 +126,13 @@ const GROUPS: u16 = 16;
 /// Paths of one host that are remembered.
 const PATHS: usize = 64;
 /// Datagrams that a share is known from at most: what was before fades.
-const WEIGHT: f64 = 100.0;
+const WEIGHT: f64 = 50.0;
 /// Datagrams below which a share says nothing.
 const WEIGHT_MIN: f64 = 12.0;
 /// A group that loses so much more than unicast is not used: what unicast costs more is less than what repairs would.
 const LOSS_MORE: f64 = 0.05;
 /// A group that loses so much is not used, whatever unicast loses: that finds the rate which this one host can take.
 const LOSS_HOPELESS: f64 = 0.5;
-/// Datagrams from which that is known.
-const WEIGHT_HOPELESS: f64 = 50.0;
 /// Standard deviations beyond which a difference is not taken for chance.
 const DEVIATIONS: f64 = 3.0;
 /// How long a group that failed is left alone at first.
@@ -176,6 +174,22 @@ mod tests {
             pauses.push(now.since(before).as_secs());
         }
         assert_eq!(pauses, [5, 10, 20]);
+    }
+
+    #[test]
+    fn what_was_under_way_when_a_group_was_given_up_is_not_held_against_it() {
+        let mut quality = Quality::default();
+        let mut now = Time(1_000_000_000);
+        quality.handle_report(&report(3, 1, 1), now);
+        assert!(quality.handle_report(&report(3, 101, 41), now));
+        // Much of what was sent before that is lost too, and told late.
+        now = now + Duration::from_millis(50);
+        assert!(!quality.handle_report(&report(3, 120, 45), now));
+        now = now + PAUSE_FIRST;
+        assert!(quality.admits(3, now));
+        assert!(!quality.handle_report(&report(3, 301, 46), now));
+        assert!(!quality.handle_report(&report(3, 401, 145), now));
+        assert!(quality.admits(3, now));
     }
 
     #[test]
