@@ -12,6 +12,7 @@ const EVERY: Asked = Asked {
     every: true,
     rate_hz: None,
     max_age_ms: None,
+    priority: ddx_wire::Priority::Normal,
 };
 
 #[test]

@@ -1,25 +1,27 @@
 //! The program that the scenarios run in their hosts: it writes and reads through the store as it is told, one line of
 //! JSON for each order and one for each answer.
 //!
-//! It is this test binary again, asked for one ignored test. Every host of a lab shares this machine's clock, so that
-//! times that two programs tell can be compared.
+//! It is this test binary again, asked for one ignored test (`worker.rs`). Every host of a lab shares this machine's clock,
+//! so that times that two programs tell can be compared.
 
-use std::collections::BTreeMap;
-use std::io::{BufRead as _, Write as _};
+mod worker;
+
 use std::process::Command;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use ddx_rig::lab::{Host, Process};
-use ddx_store::{ReaderOptions, Schema, Store, WaitKey, WaitSet, Writer, WriterOptions};
-use ddx_wire::{Delivery, Time};
+use ddx_wire::Priority;
 use serde::{Deserialize, Serialize};
 
 /// What a program can be told.
 #[derive(Debug, Deserialize, Serialize)]
 pub(crate) enum Order {
-    /// Open writers of `count` items of bytes.
-    OpenWriters { prefix: String, count: usize },
+    /// Open writers of `count` items of bytes, of at most so many.
+    OpenWriters {
+        prefix: String,
+        count: usize,
+        capacity_bytes: u32,
+    },
     /// Write each of the values from `first` on to all of them, one value each period.
     Write {
         first: u64,
@@ -28,9 +30,7 @@ pub(crate) enum Order {
         bytes: usize,
     },
     /// Open readers of `count` items.
-    OpenReaders { prefix: String, count: usize },
-    /// Open readers of `count` items that ask for something.
-    OpenReadersAs {
+    OpenReaders {
         prefix: String,
         count: usize,
         asked: Asked,
@@ -46,6 +46,8 @@ pub(crate) enum Order {
     ReadSlowly { count: u64, period_us: u64 },
     /// Read until every reader has `value` or a higher one.
     Read { value: u64, within_ms: u64 },
+    /// Begin the readers' spreads anew, with what is read from now on.
+    Forget,
     /// Close all readers.
     CloseReaders,
 }
@@ -57,6 +59,7 @@ pub(crate) struct Asked {
     pub(crate) every: bool,
     pub(crate) rate_hz: Option<f64>,
     pub(crate) max_age_ms: Option<u64>,
+    pub(crate) priority: Priority,
 }
 
 /// What it answers, or why it failed.
@@ -69,6 +72,8 @@ pub(crate) struct Done {
     at_ns: Option<u64>,
     /// What each reader has read so far.
     books: Vec<Book>,
+    /// How long each write took.
+    writes: Spread,
 }
 
 /// What one reader got and missed since it was opened.
@@ -82,6 +87,19 @@ pub(crate) struct Book {
     pub(crate) newest: Option<u64>,
     /// Values that were lower than one read before: an old one that showed as new.
     pub(crate) backwards: u64,
+    /// Values that were not byte for byte what was written.
+    pub(crate) damaged: u64,
+    /// From just before the write to the read, of values of at least 16 bytes, since it was told to forget.
+    pub(crate) ages: Spread,
+}
+
+/// How times are spread.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Serialize, PartialEq, Eq)]
+pub(crate) struct Spread {
+    pub(crate) count: u64,
+    pub(crate) p50: Duration,
+    pub(crate) p99: Duration,
+    pub(crate) max: Duration,
 }
 
 /// The running program, seen from the test. Dropped, it is killed.
@@ -97,7 +115,7 @@ impl Program {
         let binary = std::env::current_exe().unwrap();
         let arguments = [
             "--exact",
-            "program::run",
+            "program::worker::run",
             "--ignored",
             "--nocapture",
             "--test-threads=1",
@@ -145,22 +163,31 @@ impl Program {
     /// Opens writers of `prefix/0` and up.
     #[track_caller]
     pub(crate) fn open_writers(&mut self, prefix: &str, count: usize) {
+        self.open_large_writers(prefix, count, CAPACITY_BYTES);
+    }
+
+    /// Opens writers of items that hold at most so many bytes.
+    #[track_caller]
+    pub(crate) fn open_large_writers(&mut self, prefix: &str, count: usize, capacity_bytes: u32) {
         let prefix = prefix.to_owned();
-        self.ask(&Order::OpenWriters { prefix, count });
+        self.ask(&Order::OpenWriters {
+            prefix,
+            count,
+            capacity_bytes,
+        });
     }
 
     /// Opens readers of `prefix/0` and up.
     #[track_caller]
     pub(crate) fn open_readers(&mut self, prefix: &str, count: usize) {
-        let prefix = prefix.to_owned();
-        self.ask(&Order::OpenReaders { prefix, count });
+        self.open_readers_as(prefix, count, Asked::default());
     }
 
     /// Opens readers of `prefix/0` and up that ask for something.
     #[track_caller]
     pub(crate) fn open_readers_as(&mut self, prefix: &str, count: usize, asked: Asked) {
         let prefix = prefix.to_owned();
-        self.ask(&Order::OpenReadersAs {
+        self.ask(&Order::OpenReaders {
             prefix,
             count,
             asked,
@@ -202,6 +229,19 @@ impl Program {
         (at_ns, done.books)
     }
 
+    /// Orders to read all that comes for so long, and does not wait. What was read before is in no spread.
+    #[track_caller]
+    pub(crate) fn tell_read_for(&mut self, span: Duration) {
+        self.ask(&Order::Forget);
+        self.tell_read(u64::MAX, span);
+    }
+
+    /// What each reader has read when the time that was told is up.
+    #[track_caller]
+    pub(crate) fn read_for_told(&mut self, span: Duration) -> Vec<Book> {
+        self.answer(span + PATIENCE).books
+    }
+
     /// Ends it with `SIGKILL`.
     pub(crate) fn kill(mut self) {
         self.process.kill().unwrap();
@@ -214,6 +254,11 @@ impl Done {
     pub(crate) fn at_ns(&self) -> u64 {
         self.at_ns.unwrap()
     }
+
+    /// How long each write took.
+    pub(crate) fn writes(&self) -> Spread {
+        self.writes
+    }
 }
 
 impl Book {
@@ -223,202 +268,22 @@ impl Book {
     }
 }
 
-/// What the program holds.
-struct Worker {
-    store: Store,
-    writers: Vec<Writer<Vec<u8>>>,
-    set: WaitSet,
-    readers: BTreeMap<WaitKey, Book>,
-}
-
-#[test]
-#[ignore = "the program that the scenarios start in their hosts"]
-fn run() {
-    let store = Store::options().program(NAME).open().unwrap();
-    let mut worker = Worker {
-        set: WaitSet::new(&store),
-        store,
-        writers: Vec::new(),
-        readers: BTreeMap::new(),
-    };
-    // The harness may have begun a line.
-    say(&format!("\n{READY}"));
-    for line in std::io::stdin().lock().lines() {
-        let order = serde_json::from_str(&line.unwrap()).unwrap();
-        let answer: Answer = worker.obey(order).map_err(|error| error.to_string());
-        say(&format!(
-            "{ANSWER}{}",
-            serde_json::to_string(&answer).unwrap()
-        ));
-    }
-}
-
-/// Writes past the harness, which would keep it.
-fn say(line: &str) {
-    let mut out = std::io::stdout().lock();
-    writeln!(out, "{line}").and_then(|()| out.flush()).unwrap();
-}
-
-impl Worker {
-    fn obey(&mut self, order: Order) -> Result<Done, ddx_store::Error> {
-        match order {
-            Order::OpenWriters { prefix, count } => {
-                for name in names(&prefix, count) {
-                    let options = WriterOptions {
-                        capacity_bytes: Some(CAPACITY_BYTES),
-                        ..WriterOptions::default()
-                    };
-                    self.writers.push(self.store.writer_with(&name, options)?);
-                }
-            }
-            Order::Write {
-                first,
-                count,
-                period_us,
-                bytes,
-            } => self.write(first, count, period_us, bytes)?,
-            Order::OpenReaders { prefix, count } => {
-                self.open_readers(&prefix, count, Asked::default())?;
-            }
-            Order::OpenReadersAs {
-                prefix,
-                count,
-                asked,
-            } => self.open_readers(&prefix, count, asked)?,
-            Order::WriteAged {
-                first,
-                count,
-                period_us,
-                age_ms,
-            } => {
-                for value in first..first + count {
-                    thread::sleep(Duration::from_micros(period_us));
-                    let capture = Time(ddx_store::now().0 - age_ms * 1_000_000);
-                    for writer in &mut self.writers {
-                        writer.write_at(&value.to_le_bytes().to_vec(), capture)?;
-                    }
-                }
-            }
-            Order::ReadSlowly { count, period_us } => {
-                let mut payload = Vec::new();
-                let mut next = Instant::now();
-                for _ in 0..count {
-                    thread::sleep(next.saturating_duration_since(Instant::now()));
-                    next += Duration::from_micros(period_us);
-                    for key in self.readers.keys() {
-                        if let Some(reader) = self.set.reader(*key) {
-                            reader.next_into(&mut payload, Duration::ZERO)?;
-                        }
-                    }
-                }
-            }
-            Order::Read { value, within_ms } => {
-                return self.read(value, Duration::from_millis(within_ms));
-            }
-            Order::CloseReaders => {
-                for (key, _) in std::mem::take(&mut self.readers) {
-                    self.set.remove(key);
-                }
-            }
-        }
-        Ok(Done {
-            at_ns: Some(ddx_store::now().0),
-            books: Vec::new(),
-        })
-    }
-
-    fn open_readers(
-        &mut self,
-        prefix: &str,
-        count: usize,
-        asked: Asked,
-    ) -> Result<(), ddx_store::Error> {
-        let options = ReaderOptions {
-            rate: asked.rate_hz,
-            max_age: asked.max_age_ms.map(Duration::from_millis),
-            delivery: match asked.every {
-                true => Delivery::Every,
-                false => Delivery::Latest,
-            },
-            ..ReaderOptions::default()
+impl Spread {
+    /// The spread of these times.
+    pub(crate) fn of(times: &[Duration]) -> Self {
+        let mut sorted = times.to_vec();
+        sorted.sort_unstable();
+        let at = |percent: usize| {
+            let place = (sorted.len() * percent / 100).min(sorted.len().saturating_sub(1));
+            sorted.get(place).copied().unwrap_or_default()
         };
-        for name in names(prefix, count) {
-            let reader = self
-                .store
-                .raw_reader(&name, Some(&Schema::bytes()), options)?;
-            let key = self.set.add(reader);
-            self.readers.insert(key, Book::default());
-        }
-        Ok(())
-    }
-
-    fn write(
-        &mut self,
-        first: u64,
-        count: u64,
-        period_us: u64,
-        bytes: usize,
-    ) -> Result<(), ddx_store::Error> {
-        let mut payload = vec![0; bytes.max(VALUE_BYTES)];
-        let mut next = Instant::now();
-        for value in first..first + count {
-            // The pace of a sensor: what is not due yet is not written.
-            thread::sleep(next.saturating_duration_since(Instant::now()));
-            next += Duration::from_micros(period_us);
-            payload[..VALUE_BYTES].copy_from_slice(&value.to_le_bytes());
-            for writer in &mut self.writers {
-                writer.write(&payload)?;
-            }
-        }
-        Ok(())
-    }
-
-    fn read(&mut self, value: u64, within: Duration) -> Result<Done, ddx_store::Error> {
-        let deadline = Instant::now() + within;
-        let mut rung: Vec<WaitKey> = self.readers.keys().copied().collect();
-        let mut at_ns = None;
-        let mut payload = Vec::new();
-        loop {
-            for key in rung.drain(..) {
-                let (Some(reader), Some(book)) = (self.set.reader(key), self.readers.get_mut(&key))
-                else {
-                    continue;
-                };
-                while reader.next_into(&mut payload, Duration::ZERO)?.is_some() {
-                    book.enter(&payload);
-                }
-                let missed = reader.missed();
-                (book.overwritten, book.filtered, book.lost) =
-                    (missed.overwritten, missed.filtered, missed.lost);
-            }
-            if self.readers.values().all(|book| book.newest >= Some(value)) {
-                at_ns = Some(ddx_store::now().0);
-            }
-            let left = deadline.saturating_duration_since(Instant::now());
-            if at_ns.is_some() || left.is_zero() {
-                let books = self.readers.values().copied().collect();
-                return Ok(Done { at_ns, books });
-            }
-            self.set.wait(left, &mut rung);
+        Self {
+            count: u64::try_from(sorted.len()).unwrap(),
+            p50: at(50),
+            p99: at(99),
+            max: at(100),
         }
     }
-}
-
-impl Book {
-    fn enter(&mut self, payload: &[u8]) {
-        self.delivered += 1;
-        let value = payload
-            .first_chunk()
-            .map(|bytes| u64::from_le_bytes(*bytes));
-        if value < self.newest {
-            self.backwards += 1;
-        }
-        self.newest = value;
-    }
-}
-
-fn names(prefix: &str, count: usize) -> impl Iterator<Item = String> {
-    (0..count).map(move |index| format!("{prefix}/{index}"))
 }
 
 /// By which name listings show it.

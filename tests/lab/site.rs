@@ -5,6 +5,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use ddx_rig::lab::{self, Counters, Lab, Process};
+use ddx_rig::link::Profile;
 use serde_json::Value;
 
 use crate::program::{Asked, Program};
@@ -78,6 +79,11 @@ impl Site {
     /// Ends a daemon by `SIGKILL`.
     pub(crate) fn kill(&mut self, host: &str) {
         self.daemons.remove(host).unwrap().kill().unwrap();
+    }
+
+    /// The process id, on this machine, of a host's daemon.
+    pub(crate) fn pid(&mut self, host: &str) -> u32 {
+        self.daemons.get_mut(host).unwrap().pid().unwrap()
     }
 
     /// Starts a program in a host.
@@ -164,6 +170,14 @@ impl Site {
         });
     }
 
+    /// Emulates the link of a host from now on.
+    #[track_caller]
+    pub(crate) fn link(&self, host: &str, profile: &str) -> Profile {
+        let profile = Profile::parse(profile).unwrap();
+        self.lab.host(host).set_link(&profile).unwrap();
+        profile
+    }
+
     /// What the switch has counted so far.
     pub(crate) fn counters(&self) -> Counters {
         self.lab.counters().unwrap()
@@ -220,6 +234,15 @@ pub(crate) fn wait(
 )]
 pub(crate) fn report(what: &str, figure: Duration) {
     eprintln!("{what}: {figure:.1?}");
+}
+
+/// A row of figures, for the same.
+#[expect(
+    clippy::print_stderr,
+    reason = "figures for people; nothing reads them"
+)]
+pub(crate) fn row(line: &str) {
+    eprintln!("{line}");
 }
 
 /// Longer than a reader takes to confirm and a sender to repeat.
