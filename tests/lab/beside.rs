@@ -53,8 +53,7 @@ fn a_viewer_behind_a_slow_link_changes_nothing_for_a_fast_one_nor_for_the_writer
     );
 }
 
-/// In the sender commands pass at once. What they meet in the link's queue is what the sender lets pile up there, which is
-/// more than the millisecond that is promised: that is said, and the least of several runs is held to the length of the queue.
+/// What commands meet in the link's queue is what piles up there while the sender tries whether more goes.
 #[test]
 fn commands_pass_large_samples() {
     let Some(site) = Site::new(&["robot1", "base"]) else {
@@ -91,16 +90,9 @@ fn commands_pass_large_samples() {
         with.rate >= 0.95 * without.rate,
         "commands are left out: {with:?} against {without:?}"
     );
-    if with.p99 > without.p99 + PROMISED {
-        row(&format!(
-            "!!!! NOT MET: commands should be delayed by at most {PROMISED:?}, and are by {:?} (p50 {:?})",
-            with.p99.saturating_sub(without.p99),
-            with.p50.saturating_sub(without.p50)
-        ));
-    }
     assert!(
-        with.p99 <= without.p99 + QUEUE + Duration::from_millis(20),
-        "commands wait for bulk in the sender: {with:?} against {without:?}"
+        with.p50 <= without.p50 + PROMISED && with.p99 <= without.p99 + TRIES,
+        "commands wait for bulk: {with:?} against {without:?}"
     );
 }
 
@@ -253,8 +245,8 @@ fn ms(time: Duration) -> f64 {
 }
 
 const PROMISED: Duration = Duration::from_millis(1);
-/// What every profile's queue holds.
-const QUEUE: Duration = Duration::from_millis(100);
+/// One command in a hundred may meet what piles up meanwhile.
+const TRIES: Duration = Duration::from_millis(10);
 const BULK_BYTES: usize = 6 << 20;
 const ROUNDS: usize = 3;
 /// Longer than what is written in it takes.

@@ -304,10 +304,12 @@ impl Play {
         }
     }
 
-    /// One second after now, without writes, and the time that the links take, every reader holds the newest value.
+    /// One second after now, without writes, every reader holds the newest value. Where links are limited, a path that
+    /// had little of one first finds that it is alone there now, and the value takes its time to cross.
     fn ends_with_the_newest(&mut self, when: &str) -> Result<(), String> {
         let start = self.sim.now();
-        self.sim.run_for(secs(1) + self.crossing());
+        let found = self.rate.map_or(Duration::ZERO, |_| secs(1));
+        self.sim.run_for(secs(1) + found + self.crossing());
         for reader in 0..self.on.len() {
             for (name, contract) in &self.sim.host(reader).wanted {
                 let mut sources = self.sources.iter();

@@ -218,10 +218,10 @@ fn a_link_of_200_kbit_keeps_each_item_as_fresh_as_its_priority_says() {
     let (least, most) = (rates.iter().min().unwrap(), rates.iter().max().unwrap());
     assert!(4 * most <= 5 * least, "not in proportion: {rates:?}");
     assert!(carried > 160_000, "{carried} bit/s");
-    assert!(quantile(&play.backlogs, 99) < millis(100));
-    assert!(full <= 10, "{full} dropped by the queue");
-    // A datagram that is paced and another in transmission, 20 ms of delay and jitter, and its own time.
-    assert!(quantile(&seen.latencies, 90) < millis(49 + 49 + 20 + 7));
+    assert!(quantile(&play.backlogs, 99) < millis(90));
+    assert_eq!(full, 0, "dropped by the queue");
+    // A datagram in transmission, 20 ms of delay and jitter, and its own time. Who is lost is repeated later.
+    assert!(quantile(&seen.latencies, 90) < millis(49 + 20 + 7));
 
     let fast = profile("wifi-good --seed 3");
     play.sim.set_profile(1, 0, &fast);
@@ -287,8 +287,10 @@ fn a_command_waits_for_one_batch_of_bulk() {
             quantile(&beside, share)
         );
     }
-    // 200 us of 100 Mbit/s are two datagrams; what the probing for a higher rate lets pile up comes on top for a part.
-    assert!(quantile(&beside, 50) <= quantile(&alone, 50) + Duration::from_micros(200));
+    // A batch is what the rate sends in 200 us. While a higher rate is tried, a little more piles up.
+    let batch = Duration::from_micros(200);
+    assert!(quantile(&beside, 90) <= quantile(&alone, 90) + batch);
+    assert!(quantile(&beside, 100) <= quantile(&alone, 100) + millis(1));
 }
 
 fn viewers(slow: bool, contract: Contract) -> (Seen, Seen) {

@@ -3,14 +3,17 @@
 //! What piles up shows as growth of the time on the way over its recent least value. Loss alone does not slow a path
 //! down, because radio loses without being full; only loss that comes on top of what the path always loses does. The
 //! rate follows what arrives when the path is full, and grows while the sender has more to send than it lets through:
-//! at most once in the time that its effect takes to be seen, fast up to what the path was last seen to carry, slowly
-//! there, and fast again where nothing piles up far beyond.
+//! at most once in the time that its effect takes to be seen, fast up to a little less than the path was last seen to
+//! carry. There it stays, so that nothing piles up, and tries now and then whether more goes: in small steps at first,
+//! and fast where nothing piles up far beyond.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use ddx_wire::Time;
 use ddx_wire::message::ReportEntry;
+
+use super::pace::Used;
 
 /// The rate of one path.
 #[derive(Debug)]
@@ -24,12 +27,17 @@ pub(super) struct Congestion {
     loss_mean: f64,
     /// Newest growth of the time on the way.
     queue: Duration,
+    /// How much that differs from report to report.
+    jitter: Duration,
     /// The newest reports, enough to tell a rate, and whether what they say is lost was lost on a path that was not full.
     arrived: VecDeque<(Progress, bool)>,
     /// What the path carried when it was last full; none before, when the rate is a guess.
     ceiling: Option<f64>,
     /// Steps in a row beyond the ceiling without a sign of a full path.
     beyond: u32,
+    /// When it may be tried next whether the path carries more, and how long after the last time.
+    try_at: Time,
+    try_pause: Duration,
     /// Whether the rate held the sender back since it last grew.
     limited: bool,
     slowed_at: Time,
@@ -57,6 +65,15 @@ pub(crate) struct Progress {
     pub(super) bytes: u32,
     /// Number of the newest datagram of the report before.
     pub(super) from: u32,
+}
+
+/// How the time on the way compares with the least of late.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Way {
+    /// What it is longer: what has piled up.
+    pub(super) queue: Duration,
+    /// What it is shorter.
+    shorter: Duration,
 }
 
 /// One host that reports about a path, and what it said.
@@ -97,9 +114,12 @@ impl Congestion {
             loss_now: 0.0,
             loss_mean: 0.0,
             queue: Duration::ZERO,
+            jitter: JITTER_FIRST,
             arrived: VecDeque::new(),
             ceiling: None,
             beyond: 0,
+            try_at: now,
+            try_pause: TRY_PAUSE_MIN,
             limited: false,
             slowed_at: now,
             slowed_until: now,
@@ -136,13 +156,13 @@ impl Congestion {
         permille(self.loss_mean)
     }
 
-    /// Takes in a report. `limited` tells whether the rate held the sender back since the one before, and `round_trip` how
+    /// Takes in a report. `used` tells how the path was used since the one before, and `round_trip` how
     /// long it takes now until what is sent is reported, with what has piled up; `sent` is the number of the newest datagram.
     pub(super) fn handle_report(
         &mut self,
         progress: &Progress,
-        queue: Duration,
-        limited: bool,
+        way: Way,
+        used: Used,
         round_trip: Duration,
         sent: u32,
         now: Time,
@@ -151,7 +171,11 @@ impl Congestion {
             // The link is back, perhaps as it was.
             self.bytes_per_second = (rate / 2.0).max(self.bytes_per_second);
         }
-        self.queue = queue;
+        let Way { queue, shorter } = way;
+        let queue_before = std::mem::replace(&mut self.queue, queue);
+        if queue_before <= self.queue_low() && !self.is_trying(used) {
+            self.note_jitter(queue.saturating_sub(queue_before));
+        }
         let all = f64::from(progress.received) + f64::from(progress.missing);
         if all > 0.0 {
             self.loss_now = progress.loss();
@@ -159,60 +183,101 @@ impl Congestion {
         if self.tells_loss(progress) {
             self.loss_mean += (self.loss_now - self.loss_mean) * all / (all + MEAN_DATAGRAMS);
         }
-        let (arrived, lost, datagrams) = self.of_late(progress);
+        // The link works on what has piled up when nothing more is sent, and is idle then.
+        let busy = progress.span.saturating_sub(used.idle) + queue;
+        let least = f64::from(progress.bytes) / self.bytes_per_second;
+        let busy = busy.max(Duration::from_secs_f64(least)).min(progress.span);
+        let (arrived, lost, datagrams) = self.of_late(progress, busy);
         let capacity = arrived / (1.0 - self.loss.min(0.7));
-        self.limited |= limited;
+        self.limited |= used.limited;
+        if shorter >= SHORTER_MIN.max(self.datagram_time() / 2) {
+            // No link got faster by waiting: this is another one.
+            (self.ceiling, self.beyond) = (None, 0);
+        }
 
         let chance = (self.loss * (1.0 - self.loss) / datagrams).sqrt();
         let enough = datagrams >= f64::from(ARRIVED_DATAGRAMS);
         let drops = enough && lost > self.loss + LOSS_STEP + chance;
-        let seen_after = (progress.span / 2).max(round_trip);
-        if self.queue >= QUEUE_FULL {
-            self.beyond = 0;
+        // In the report after the one that is on its way now.
+        let seen_after = progress.span + round_trip;
+        let low = self.queue_low();
+        let full = match self.ceiling {
+            // What piles up although the sender had little to send is not its own.
+            _ if !self.limited => 2 * QUEUE_LOW_MAX,
+            // The steps are large.
+            None => low,
+            // One report may be late for reasons of its own.
+            Some(_) if queue_before <= low => 2 * QUEUE_LOW_MAX,
+            Some(_) => 2 * low,
+        };
+        if self.queue >= full {
             if now >= self.slowed_until && self.was_sent_since(progress) {
-                self.slow_down(capacity);
+                self.slow_down(capacity, seen_after);
                 self.slowed(sent, seen_after, now);
             }
         } else if drops {
-            self.beyond = 0;
             // A full path with a short queue, or one that has begun to lose: if slowing down does not help, it is the
             // latter.
             self.loss += (lost - self.loss) / 2.0;
             self.bytes_per_second *= 0.85;
             self.slowed(sent, seen_after, now);
         } else {
-            if self.queue > QUEUE_LOW * 3 / 2
-                && let Some(ceiling) = self.ceiling
-            {
-                // Something may pile up: no more than arrives, unless that is little because little was sent.
-                let most = capacity.max(0.98 * ceiling);
-                self.bytes_per_second = self.bytes_per_second.min(most);
-            }
             let weight = (datagrams / f64::from(ARRIVED_DATAGRAMS)).min(1.0);
             self.loss += (lost - self.loss) * weight / 8.0;
-            let since = self.grown_at.max(self.slowed_at);
-            if self.queue <= QUEUE_LOW && self.limited && now >= since + seen_after {
-                (self.grown_at, self.limited) = (now, false);
-                self.grow(capacity, round_trip);
+            if self.queue > low {
+                self.draw_back(capacity, seen_after, now);
+            } else if self.limited && now >= self.grown_at.max(self.slowed_at) + seen_after {
+                self.grow(capacity, seen_after, now);
             }
         }
         self.bytes_per_second = self.bytes_per_second.clamp(RATE_MIN, RATE_MAX);
+    }
+
+    /// Whether the rate may be more than the path carries.
+    fn is_trying(&self, used: Used) -> bool {
+        self.ceiling.map_or(used.limited, |carries| {
+            self.bytes_per_second > 0.96 * carries
+        })
+    }
+
+    fn note_jitter(&mut self, differs: Duration) {
+        let differs = differs.min(QUEUE_LOW_MAX);
+        // What is seldom counts for long.
+        self.jitter = if differs > self.jitter {
+            (3 * self.jitter + differs) / 4
+        } else {
+            (63 * self.jitter + differs) / 64
+        };
+    }
+
+    fn datagram_time(&self) -> Duration {
+        Duration::from_secs_f64(DATAGRAM / self.bytes_per_second)
+    }
+
+    /// Growth of the time on the way up to which nothing piles up, as far as one can tell.
+    fn queue_low(&self) -> Duration {
+        // What else passes in between takes its time.
+        (4 * self.jitter + self.datagram_time().max(QUEUE_LOW_MIN)).min(QUEUE_LOW_MAX)
     }
 
     fn slowed(&mut self, sent: u32, seen_after: Duration, now: Time) {
         self.slowed_number = sent;
         (self.slowed_at, self.slowed_queue) = (now, self.queue);
         self.slowed_until = now + seen_after;
+        self.beyond = 0;
+        // Alarms that come often do not put it off for ever.
+        if self.try_at <= now {
+            self.try_at = now + self.try_pause;
+        }
         for (_, counts) in &mut self.arrived {
             *counts = false;
         }
     }
 
     /// The path is full, and carries this.
-    fn slow_down(&mut self, capacity: f64) {
-        // So that what has piled up is gone in a third of a second; what drains already needs time, not less.
-        let share = 1.0 - self.queue.as_secs_f64() / DRAIN.as_secs_f64();
-        let share = share.max(0.6);
+    fn slow_down(&mut self, capacity: f64, seen_after: Duration) {
+        // What drains already needs time, not less.
+        let share = self.share_to_drain(seen_after);
         let least = if self.queue < self.slowed_queue {
             1.0
         } else {
@@ -222,43 +287,81 @@ impl Congestion {
             // What was lost before the first sign of a full path was lost because it was full.
             (self.loss, self.loss_mean) = (0.0, 0.0);
         }
-        // One measurement is a rough one.
-        self.ceiling = Some(match self.ceiling {
+        let carries = match self.ceiling {
+            // All that was sent arrives: something else held it up, or there is a little too much of it.
+            Some(ceiling) if capacity >= KEPT_UP * self.bytes_per_second => {
+                ((ceiling + capacity) / 2.0).clamp(0.99 * ceiling, 2.0 * ceiling)
+            }
+            // One measurement is a rough one.
             Some(ceiling) if (0.5..2.0).contains(&(capacity / ceiling)) => {
                 (ceiling + capacity) / 2.0
             }
             _ => capacity,
-        });
-        self.bytes_per_second = (capacity * share).min(self.bytes_per_second * least);
+        };
+        self.ceiling = Some(carries);
+        self.bytes_per_second = (capacity.min(carries) * share).min(self.bytes_per_second * least);
+    }
+
+    /// Share of what the path carries at which what has piled up is gone soon.
+    fn share_to_drain(&self, seen_after: Duration) -> f64 {
+        let drain = (4 * seen_after).clamp(DRAIN_MIN, DRAIN_MAX);
+        let share = 1.0 - self.queue.as_secs_f64() / drain.as_secs_f64();
+        share.clamp(0.6, STAY)
+    }
+
+    /// Something begins to pile up: what was tried is too much.
+    fn draw_back(&mut self, capacity: f64, seen_after: Duration, now: Time) {
+        let Some(ceiling) = self.ceiling else {
+            return;
+        };
+        if self.bytes_per_second <= STAY * ceiling {
+            return;
+        }
+        let ceiling = match capacity / ceiling {
+            ..1.0 => ceiling,
+            ..2.0 => (ceiling + capacity) / 2.0,
+            _ => capacity,
+        };
+        self.ceiling = Some(ceiling);
+        self.bytes_per_second = self.share_to_drain(seen_after) * ceiling;
+        self.try_pause = if self.beyond > 0 {
+            TRY_PAUSE_MIN
+        } else {
+            (2 * self.try_pause).min(TRY_PAUSE_MAX)
+        };
+        (self.beyond, self.try_at) = (0, now + self.try_pause);
     }
 
     /// Nothing piles up, and more could be sent.
-    fn grow(&mut self, capacity: f64, round_trip: Duration) {
+    fn grow(&mut self, capacity: f64, seen_after: Duration, now: Time) {
         let rate = self.bytes_per_second;
         // What was never tried is not known to fit.
         let tried = rate.max(4.0 * capacity).max(RATE_FIRST / 8.0);
         let grown = match self.ceiling {
-            None => rate * 2.0,
-            Some(ceiling) if rate < 0.9 * ceiling => (rate * 1.5).min(0.95 * ceiling),
-            Some(ceiling) if rate < BEYOND * ceiling => {
-                // What piles up before that is seen stays small.
-                let round_trip = round_trip.as_secs_f64().max(0.001);
-                let share = (STEP.as_secs_f64() / round_trip).clamp(0.02, 0.05);
+            None => rate * 1.5,
+            Some(ceiling) if rate < 0.9 * ceiling => (rate * 1.5).min(STAY * ceiling),
+            Some(_) if now < self.try_at => return,
+            Some(ceiling) => {
+                // What piles up before it is seen stays small.
+                let time = seen_after.as_secs_f64().max(0.001);
+                let low = self.queue_low().as_secs_f64() / time;
+                let mut share = (low / 3.0).clamp(0.0025, 0.05);
+                if rate > ceiling * (1.0 + low / 2.0).clamp(1.03, BEYOND) {
+                    self.beyond += 1;
+                    share = (share * f64::from(1_u32 << self.beyond.min(7))).min(0.5);
+                }
                 // So that of several paths that share a link the slow ones catch up.
-                (rate * (1.0 + share)).max(rate + STEP_BYTES / round_trip)
-            }
-            Some(_) => {
-                self.beyond = self.beyond.saturating_add(1);
-                rate * if self.beyond > 2 { 1.5 } else { 1.15 }
+                (rate * (1.0 + share)).max(rate + STEP_BYTES / time)
             }
         };
+        (self.grown_at, self.limited) = (now, false);
         self.bytes_per_second = grown.min(tried);
     }
 
     /// Whether what a report says is lost was lost on a path that was not full: what a full queue dropped shows when a later
     /// datagram has passed it.
     fn tells_loss(&self, progress: &Progress) -> bool {
-        self.queue <= QUEUE_LOW && self.was_sent_since(progress)
+        self.queue <= self.queue_low() && self.was_sent_since(progress)
     }
 
     /// Whether a report is about datagrams that left after the rate was last lowered.
@@ -266,11 +369,13 @@ impl Congestion {
         progress.from.wrapping_sub(self.slowed_number) < 1 << 31
     }
 
-    /// Bytes per second that arrived of late, over enough datagrams that the jitter of one does not count; and the share
+    /// Bytes per second that arrived of late while the link was `busy`, over enough datagrams that the jitter of one does not count; and the share
     /// of datagrams that were lost while the path was not full, and of how many.
-    fn of_late(&mut self, progress: &Progress) -> (f64, f64, f64) {
+    fn of_late(&mut self, progress: &Progress, busy: Duration) -> (f64, f64, f64) {
         let counts = self.tells_loss(progress);
-        self.arrived.push_back((*progress, counts));
+        let span = busy;
+        self.arrived
+            .push_back((Progress { span, ..*progress }, counts));
         let enough = |arrived: &VecDeque<(Progress, bool)>| {
             let later = || arrived.iter().skip(1).map(|(progress, _)| progress);
             later().map(|p| p.received).sum::<u32>() >= ARRIVED_DATAGRAMS
@@ -357,17 +462,20 @@ impl Reporter {
         &mut self,
         report: &ReportEntry,
         now: Time,
-    ) -> Option<(Progress, Duration)> {
+    ) -> Option<(Progress, Way)> {
         let progress = Progress::between(&self.last, report);
         self.last = *report;
         self.round_trip = round_trip(report, now);
         let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
+        let before = self.least.get();
         let least = self.least.update(delay, now);
-        let queue = u64::try_from(delay.saturating_sub(least)).unwrap_or(0);
-        let (progress, queue) = (progress?, Duration::from_micros(queue));
+        let micros = |span: i64| Duration::from_micros(u64::try_from(span).unwrap_or(0));
+        let queue = micros(delay.saturating_sub(least));
+        let shorter = micros(before.unwrap_or(delay).saturating_sub(delay));
+        let progress = progress?;
         let loss = progress.loss();
         self.strain = Some((Strain { queue, loss }, now));
-        Some((progress, queue))
+        Some((progress, Way { queue, shorter }))
     }
 
     /// How hard the path is for it, if it said so of late.
@@ -380,8 +488,8 @@ impl Reporter {
 impl Strain {
     /// Whether what slows the path down for one reporter is not seen by this other one: it lies behind the group.
     pub(super) fn is_not_shared_by(&self, other: &Self) -> bool {
-        let is_strained = self.queue >= QUEUE_FULL || self.loss > other.loss + LOSS_STEP;
-        is_strained && other.queue <= QUEUE_LOW && other.loss <= self.loss
+        let is_strained = self.queue >= 2 * QUEUE_LOW_MAX || self.loss > other.loss + LOSS_STEP;
+        is_strained && other.queue <= QUEUE_LOW_MAX && other.loss <= self.loss
     }
 }
 
@@ -396,6 +504,10 @@ fn round_trip(report: &ReportEntry, now: Time) -> Option<Duration> {
 }
 
 impl Least {
+    fn get(&self) -> Option<i64> {
+        self.present.into_iter().chain(self.former).min()
+    }
+
     /// Takes in a value; the least one of late.
     fn update(&mut self, value: i64, now: Time) -> i64 {
         if now.since(self.since) >= WINDOW {
@@ -428,27 +540,38 @@ const RATE_MIN: f64 = 10_000.0;
 const RATE_SILENT: f64 = 60_000.0;
 /// More than a core can seal.
 const RATE_MAX: f64 = 5e9;
-/// Growth of the time on the way that means a full path: above what jitter does to the least of several datagrams, and
-/// a third of what queues on the way should hold.
-const QUEUE_FULL: Duration = Duration::from_millis(30);
-/// Growth below which the rate may grow.
-const QUEUE_LOW: Duration = Duration::from_millis(15);
-/// How long what has piled up may take to drain.
-const DRAIN: Duration = Duration::from_millis(300);
+/// What no jitter takes from the least time on the way of late.
+const SHORTER_MIN: Duration = Duration::from_millis(10);
+/// Bytes of a datagram on most links.
+const DATAGRAM: f64 = 1_500.0;
+/// Growth of the time on the way that says nothing, whatever the jitter: what a paced batch takes.
+const QUEUE_LOW_MIN: Duration = Duration::from_micros(200);
+/// Growth that says something, whatever the jitter: twice as much is a third of what queues on the way should hold.
+const QUEUE_LOW_MAX: Duration = Duration::from_millis(15);
+/// A guess for a path that was never used.
+const JITTER_FIRST: Duration = Duration::from_millis(1);
+/// How long what has piled up may take to drain: some of the times that it takes to see that.
+const DRAIN_MIN: Duration = Duration::from_millis(50);
+const DRAIN_MAX: Duration = Duration::from_millis(300);
+/// Share of what the path carries at which the rate stays.
+const STAY: f64 = 0.95;
+/// Share of what is sent that arrives where the path carries all of it.
+const KEPT_UP: f64 = 0.9;
+/// How long it stays there before more is tried: at first, and after tries that failed.
+const TRY_PAUSE_MIN: Duration = Duration::from_millis(250);
+const TRY_PAUSE_MAX: Duration = Duration::from_millis(500);
 /// Loss beyond the usual that means a full path whose queue is too short to show.
 const LOSS_STEP: f64 = 0.15;
-/// Least growth in a round trip: a part of a datagram.
+/// Least growth in the time until it is seen: a part of a datagram.
 const STEP_BYTES: f64 = 60.0;
-/// What the growth of a round trip lets pile up in the next.
-const STEP: Duration = Duration::from_micros(2_500);
 /// Multiple of what the path carried when it was full, above which it is another path.
-const BEYOND: f64 = 1.25;
+const BEYOND: f64 = 1.15;
 /// Datagrams that tell a rate, whatever the jitter of each.
 const ARRIVED_DATAGRAMS: u32 = 8;
 /// Least time that tells a rate.
-const ARRIVED_SPAN: Duration = Duration::from_millis(40);
+const ARRIVED_SPAN: Duration = Duration::from_millis(100);
 /// Reports that are remembered for it at most.
-const ARRIVED_REPORTS: usize = 16;
+const ARRIVED_REPORTS: usize = 32;
 /// What takes longer is an error of a peer.
 const ROUND_TRIP_MAX: Duration = Duration::from_secs(10);
 /// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
@@ -469,6 +592,8 @@ mod tests {
         queue_bytes: f64,
         worst: Duration,
         dropped: f64,
+        /// Bytes lost that are not a whole datagram yet.
+        owed: f64,
     }
 
     fn run(link: &mut Bottleneck, congestion: &mut Congestion, from: Time, span: Duration) -> f64 {
@@ -488,17 +613,27 @@ mod tests {
             delivered += arrived;
             let delay = link.queue_bytes / link.rate;
             link.worst = link.worst.max(Duration::from_secs_f64(delay));
-            let packets = |bytes: f64| whole((bytes / 1200.0).ceil());
+            link.owed += sent * link.loss + full;
+            let missing = whole(link.owed / 1200.0);
+            link.owed -= f64::from(missing) * 1200.0;
             let progress = Progress {
                 span: step,
-                received: packets(arrived).max(1),
-                missing: packets(sent * link.loss + full),
+                received: whole((arrived / 1200.0).ceil()).max(1),
+                missing,
                 bytes: whole(arrived),
                 from: u32::MAX / 4,
             };
             let queue = Duration::from_secs_f64(delay);
             let round_trip = Duration::from_millis(20) + queue;
-            congestion.handle_report(&progress, queue, true, round_trip, 0, now);
+            let used = Used {
+                limited: true,
+                idle: Duration::ZERO,
+            };
+            let way = Way {
+                queue,
+                ..Way::default()
+            };
+            congestion.handle_report(&progress, way, used, round_trip, 0, now);
         }
         delivered / span.as_secs_f64()
     }
@@ -519,6 +654,7 @@ mod tests {
             queue_bytes: 0.0,
             worst: Duration::ZERO,
             dropped: 0.0,
+            owed: 0.0,
         }
     }
 
@@ -581,7 +717,8 @@ mod tests {
             from: 0,
         };
         let now = Time(10_000_000_000);
-        congestion.handle_report(&progress, Duration::ZERO, false, Duration::ZERO, 0, now);
+        let (way, used) = (Way::default(), Used::default());
+        congestion.handle_report(&progress, way, used, Duration::ZERO, 0, now);
         assert_eq!(congestion.rate(), 6_250_000);
     }
 
@@ -628,14 +765,15 @@ mod tests {
         let mut queue = |number, delay_us, s: u64| {
             let at = Time(s * 1_000_000_000);
             let heard = reporter.handle_report(&report(number, delay_us), at);
-            heard.unwrap().1.as_micros()
+            let way = heard.unwrap().1;
+            (way.queue.as_micros(), way.shorter.as_micros())
         };
-        assert_eq!(queue(2, 1_400, 1), 400);
-        assert_eq!(queue(3, 800, 2), 0);
-        assert_eq!(queue(4, u32::MAX - 99, 3), 0, "below zero");
-        assert_eq!(queue(5, 900, 4), 1_000);
+        assert_eq!(queue(2, 1_400, 1), (400, 0));
+        assert_eq!(queue(3, 800, 2), (0, 200));
+        assert_eq!(queue(4, u32::MAX - 99, 3), (0, 900), "below zero");
+        assert_eq!(queue(5, 900, 4), (1_000, 0));
         // Forgotten after twenty seconds.
-        assert_eq!(queue(6, 900, 30), 1_000);
-        assert_eq!(queue(7, 900, 60), 0);
+        assert_eq!(queue(6, 900, 30), (1_000, 0));
+        assert_eq!(queue(7, 900, 60).0, 0);
     }
 }

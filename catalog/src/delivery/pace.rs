@@ -9,37 +9,55 @@ use ddx_wire::Time;
 pub(super) struct Pace {
     /// When the last batch has left, at the paced rate.
     free_at: Time,
-    /// Whether it held anything back since this was last asked.
-    limited: bool,
+    used: Used,
+    asked: Time,
+}
+
+/// How a path was used for a while.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Used {
+    /// Whether the rate held anything back.
+    pub(super) limited: bool,
+    /// How long nothing left.
+    pub(super) idle: Duration,
 }
 
 impl Pace {
     pub(super) fn new(now: Time) -> Self {
         Self {
             free_at: now,
-            limited: false,
+            used: Used::default(),
+            asked: now,
         }
     }
 
     /// Tells when the next batch may go, if that is later than `now`. Call it only with something to send.
     pub(super) fn blocked_until(&mut self, now: Time) -> Option<Time> {
         let blocked = self.free_at > now;
-        self.limited |= blocked;
+        self.used.limited |= blocked;
         blocked.then_some(self.free_at)
     }
 
     /// Notes that a batch goes now, at `rate` bytes per second.
     pub(super) fn spend(&mut self, bytes: usize, rate: u64, now: Time) {
-        let span = (bytes as u128) * NANOS / u128::from(rate.max(1));
-        let span = Duration::from_nanos(u64::try_from(span).unwrap_or(u64::MAX));
+        let span = span_of(bytes, rate);
+        self.used.idle += now.since(self.free_at.max(self.asked));
         // A thread that woke late may catch up on one burst, not on its whole idle time.
         self.free_at = self.free_at.max(now - BURST) + span;
     }
 
-    /// Whether the rate held anything back since this was last called.
-    pub(super) fn take_limited(&mut self) -> bool {
-        std::mem::take(&mut self.limited)
+    /// How it was used since this was last called.
+    pub(super) fn take_used(&mut self, now: Time) -> Used {
+        self.used.idle += now.since(self.free_at.max(self.asked));
+        self.asked = now;
+        std::mem::take(&mut self.used)
     }
+}
+
+/// How long bytes take at a rate, in bytes per second.
+pub(super) fn span_of(bytes: usize, rate: u64) -> Duration {
+    let span = (bytes as u128) * NANOS / u128::from(rate.max(1));
+    Duration::from_nanos(u64::try_from(span).unwrap_or(u64::MAX))
 }
 
 /// Greatest batch at a rate, bytes: what it sends in 200 us. One datagram may always go.
@@ -71,6 +89,16 @@ mod tests {
             now = now + Duration::from_micros(10);
         }
         assert!((1_000_000..=1_004_000).contains(&sent), "{sent}");
-        assert!(pace.take_limited() && !pace.take_limited());
+        let used = pace.take_used(now);
+        assert!(
+            used.limited && used.idle < Duration::from_micros(1_100),
+            "{used:?}"
+        );
+        let later = now + Duration::from_secs(1);
+        let idle = Used {
+            limited: false,
+            idle: later.since(pace.free_at),
+        };
+        assert_eq!(pace.take_used(later), idle);
     }
 }

@@ -1,4 +1,4 @@
-//! One destination: its rate, its three lanes, and the streams that share it.
+//! One destination: its rate, its lanes, and the streams that share it.
 //!
 //! Next to nothing is queued here: what the path cannot take now stays in the store, and is read again when it can, the
 //! newest first. Streams take turns by weight, counted in bytes.
@@ -15,7 +15,7 @@ use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 use super::books::SentBooks;
 use super::congestion::{Congestion, Reporter};
 use super::flow::{Flow, Progress};
-use super::pace::{Pace, batch_bytes};
+use super::pace::{Pace, batch_bytes, span_of};
 use super::parity;
 use super::queue::{DATAGRAM_OVERHEAD, Limit, Queue};
 use super::sender::FIRST_UNICAST;
@@ -35,6 +35,7 @@ pub(super) struct Path<P> {
     segments_max: usize,
     pace: Pace,
     congestion: Congestion,
+    /// By rank.
     lanes: [Queue; LANES.len()],
     flows: BTreeMap<StreamId, Flow<P>>,
     /// Flows that want something from the store, by turn.
@@ -468,15 +469,15 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             return;
         };
         reporter.seen = reporter.seen.max(departed);
-        if let Some((progress, queue)) = reporter.handle_report(report, now) {
-            let round_trip = reporter.round_trip().unwrap_or(self.round_trip + queue);
+        if let Some((progress, way)) = reporter.handle_report(report, now) {
+            let round_trip = reporter.round_trip().unwrap_or(self.round_trip + way.queue);
             if self.is_slow_for_one(from, now) {
                 return;
             }
-            let limited = self.pace.take_limited();
+            let used = self.pace.take_used(now);
             let sent = self.datagrams;
             self.congestion
-                .handle_report(&progress, queue, limited, round_trip, sent, now);
+                .handle_report(&progress, way, used, round_trip, sent, now);
         }
     }
 
@@ -530,16 +531,33 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
 
     /// When something can leave, if that is later than `now`.
     pub(super) fn blocked_until(&mut self, now: Time) -> Option<Time> {
-        self.pace.blocked_until(now)
+        // A command waits for no other datagram of this host; those after it wait longer.
+        let ahead = if self.has_command() {
+            self.command_ahead()
+        } else {
+            Duration::ZERO
+        };
+        self.pace.blocked_until(now + ahead).map(|at| at - ahead)
+    }
+
+    /// Whether a command is about to leave, which waits for the rate only if there are many.
+    pub(super) fn has_command(&self) -> bool {
+        self.lanes[COMMANDS].is_ready()
+    }
+
+    /// By how much commands may be ahead of the rate: what one datagram takes, of another and of their own.
+    fn command_ahead(&self) -> Duration {
+        let batch = batch_bytes(self.congestion.rate()).max(self.datagram_bytes);
+        span_of(2 * batch, self.congestion.rate())
     }
 
     /// Most urgent lane that has something, as a rank: 0 is first.
     pub(super) fn rank(&self) -> Option<usize> {
         let queued = self.lanes.iter().position(Queue::is_ready);
         let waiting = if !self.repairing.is_empty() {
-            Some(0)
+            Some(REPEATS)
         } else if !self.sending.is_empty() {
-            Some(2)
+            Some(BULK)
         } else {
             None
         };
@@ -605,7 +623,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
 
     /// Cuts the next fragments into datagrams: a batch of one stream, or what is asked for again.
     fn cut(&mut self, rank: usize, limit: Limit, now: Time) {
-        let repairs = rank == 0;
+        let repairs = rank == REPEATS;
         let turns = if repairs {
             &self.repairing
         } else {
@@ -710,6 +728,9 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             let lane = lane_of(flow.is_command(), again.is_some());
             self.turn = flow.charge(record.encoded_len(), self.turn);
             self.lanes[lane].push(&record, self.datagram_bytes);
+            if lane == COMMANDS {
+                self.lanes[lane].close();
+            }
             Offered::Goes
         };
         self.take_turns(stream);
@@ -727,7 +748,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             if len <= self.datagram_bytes {
                 continue;
             }
-            self.lanes[0].push_padding(len);
+            self.lanes[REPEATS].push_padding(len);
         }
     }
 
@@ -765,7 +786,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             fragment: None,
             payload: &others,
         };
-        self.lanes[0].push(&record, self.datagram_bytes);
+        self.lanes[REPEATS].push(&record, self.datagram_bytes);
     }
 
     fn forget_turns(&mut self, stream: StreamId) {
@@ -796,7 +817,11 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
 }
 
 fn lane_of(command: bool, again: bool) -> usize {
-    if command || again { 0 } else { 1 }
+    match (command, again) {
+        (true, _) => COMMANDS,
+        (false, true) => REPEATS,
+        (false, false) => VALUES,
+    }
 }
 
 /// Bytes that may wait in one lane: what the rate sends in 4 ms, and at least the datagram that is being filled.
@@ -804,8 +829,12 @@ fn room(rate: u64) -> usize {
     usize::try_from(rate / 250).map_or(ROOM_MAX, |bytes| bytes.clamp(1, ROOM_MAX))
 }
 
-/// The lanes of samples, most urgent first.
-const LANES: [Lane; 3] = [Lane::Commands, Lane::Values, Lane::Bulk];
+/// What is sent, by rank, most urgent first, and its lane on the wire.
+const LANES: [Lane; 4] = [Lane::Commands, Lane::Commands, Lane::Values, Lane::Bulk];
+const COMMANDS: usize = 0;
+const REPEATS: usize = 1;
+const VALUES: usize = 2;
+const BULK: usize = 3;
 /// `PROTOCOL.md#limits`: what one segmented send of the kernel takes.
 const BATCH_BYTES: usize = 60_000;
 /// `PROTOCOL.md#limits`: bytes queued in one lane of one path.

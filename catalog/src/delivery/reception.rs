@@ -151,7 +151,7 @@ const WORTH_BYTES: usize = 2_048;
 /// `PROTOCOL.md#reports`: least time between two reports of a path.
 const PAUSE: Duration = Duration::from_millis(50);
 /// The same while much arrives.
-const PAUSE_MANY: Duration = Duration::from_millis(20);
+const PAUSE_MANY: Duration = Duration::from_millis(5);
 /// A pause that is reported as over.
 const SILENCE: Duration = Duration::from_millis(400);
 /// How long the length of long datagrams is remembered.

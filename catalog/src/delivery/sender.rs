@@ -228,6 +228,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
                     self.hungry.insert(*to);
                 }
             }
+            if path.has_command() {
+                self.blocked.clear(*to);
+            }
             enlist(&mut self.ready, &self.blocked, *to);
         }
         for to in gone {
@@ -258,6 +261,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             }
             Some(_) | None => path.fetched(fetch, found, newest, now),
         };
+        if path.has_command() {
+            self.blocked.clear(fetch.to);
+        }
         self.hungry.insert(fetch.to);
         enlist(&mut self.ready, &self.blocked, fetch.to);
         if let (Some(Offered::Goes | Offered::Begins), Some((meta, _))) = (offered, found) {

@@ -273,6 +273,29 @@ fn repairs_and_commands_leave_before_values_and_values_before_bulk() {
 }
 
 #[test]
+fn a_command_waits_for_no_bulk_and_many_of_them_wait_for_the_rate() {
+    let mut sender = sender(Via::Unicast, 1);
+    let command = StreamId(STREAM.0 + 1);
+    let mut urgent = route(Via::Unicast, 1);
+    urgent.contract.priority = Priority::Command;
+    sender.open(command, &urgent, Time(0));
+    sender.write(STREAM, &meta(1, 1), &vec![0; 1 << 20], Time(0));
+    sender.flush(Time(0));
+    drain(&mut sender);
+    assert!(drain(&mut sender).is_empty(), "the rate forbids more bulk");
+    let mut left = 0;
+    for seq in 1..=20 {
+        sender.write(command, &meta(1, seq), &vec![0; 1_000], Time(0));
+        sender.flush(Time(0));
+        let sent = drain(&mut sender);
+        assert!(seq > 1 || sent.len() == 1, "the first leaves at once");
+        left += sent.len();
+    }
+    // 200 us of 12.5 MB/s are two of them, and one more batch may be ahead.
+    assert!((3..=6).contains(&left), "{left}");
+}
+
+#[test]
 fn a_full_path_takes_the_newest_when_it_has_room() {
     let mut sender = sender(Via::Unicast, 1);
     // More than waits for a path of 12.5 MB/s: what does not fit stays in the store.
