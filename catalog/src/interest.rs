@@ -720,6 +720,7 @@ mod tests {
             name: name.clone(),
             schema_hash: SchemaHash([1; 16]),
             capacity_bytes: 8,
+            depth: 8,
             epoch: Epoch(1),
             writer: WriterState::Live,
             program: String::new(),

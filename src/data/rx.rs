@@ -124,6 +124,14 @@ struct Mirror {
     passed: Passed,
 }
 
+/// Samples of one stream that come one after the other: what they have in common.
+struct Run<'a> {
+    of: (Tag, StreamId),
+    mirror: Option<&'a mut Mirror>,
+    counts: &'a mut Mirrored,
+    clock: Option<ClockOffset>,
+}
+
 impl Rx {
     /// Starts the thread on the socket of unicast samples and the one of multicast samples.
     pub(crate) fn start(
@@ -379,29 +387,45 @@ impl State {
 impl Inbound {
     /// Writes to the mirrors what the receiver has whole.
     fn take(&mut self, receiver: &mut Receiver, now: Time) {
+        let Self {
+            mirrors,
+            streams,
+            clocks,
+            traffic,
+        } = self;
+        let mut run: Option<Run<'_>> = None;
         while let Some(sample) = receiver.poll_sample() {
-            let Some(stream) = self.streams.get_mut(&(sample.tag, sample.stream)) else {
+            let at = (sample.tag, sample.stream);
+            if run.as_ref().is_none_or(|run| run.of != at) {
+                run = streams.get_mut(&at).map(|stream| Run {
+                    of: at,
+                    mirror: mirrors.get_mut(&stream.mirror),
+                    counts: &mut stream.counts,
+                    // Nothing may have renewed it since the last stream ended.
+                    clock: clocks
+                        .get(&sample.tag)
+                        .map(|(clock, told)| clock.aged(now.since(*told))),
+                });
+            }
+            let Some(run) = &mut run else {
                 continue;
             };
-            let Some(mirror) = self.mirrors.get_mut(&stream.mirror) else {
-                stream.counts.refused += 1;
+            let Some(mirror) = &mut run.mirror else {
+                run.counts.refused += 1;
                 continue;
             };
-            // Nothing may have renewed it since the last stream ended.
-            let clock = self.clocks.get(&sample.tag);
-            let clock = clock.map(|(clock, told)| clock.aged(now.since(*told)));
-            match mirror.take(&sample, clock.as_ref(), now) {
+            match mirror.take(&sample, run.clock.as_ref(), now) {
                 Fate::Written => {
-                    stream.counts.written += 1;
-                    stream.counts.bytes += sample.payload.len() as u64;
+                    run.counts.written += 1;
+                    run.counts.bytes += sample.payload.len() as u64;
                 }
                 Fate::Stale => {
-                    stream.counts.stale += 1;
-                    count(&self.traffic.stale_samples, 1);
+                    run.counts.stale += 1;
+                    count(&traffic.stale_samples, 1);
                 }
                 Fate::Refused => {
-                    stream.counts.refused += 1;
-                    count(&self.traffic.refused_samples, 1);
+                    run.counts.refused += 1;
+                    count(&traffic.refused_samples, 1);
                 }
             }
         }

@@ -11,11 +11,11 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ddx_catalog::delivery::{Due, Fetch, Route, Sender, SenderConfig, SenderEvent, Want};
-use ddx_store::{Cursor, Meta, RawGuard, RawReader, Store, WaitKey, WaitSet, Waker};
+use ddx_store::{Cursor, Meta, RawGuard, RawReader, Store, Taken, WaitKey, WaitSet, Waker};
 use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::sample::SampleMeta;
 use ddx_wire::seal::Sealer;
-use ddx_wire::{Epoch, Seq, StreamId, Tag, Time};
+use ddx_wire::{Delivery, Epoch, Seq, StreamId, Tag, Time};
 
 use super::board::{self, Board, Outward};
 use super::{Traffic, count, mailbox};
@@ -27,8 +27,10 @@ const ORDERS: usize = 4096;
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Longest sleep.
 const SLEEP_MAX: Duration = Duration::from_millis(100);
-/// Samples of one item sent before the next item gets its turn.
-const SAMPLES_PER_TURN: usize = 64;
+/// Samples of one item read before the next item gets its turn: of small ones, what fills one segmented send.
+const SAMPLES_PER_TURN: usize = 512;
+/// A stream that was behind its paths for so long goes on with its newest sample, unless each one is wanted.
+const BEHIND_MAX: Duration = Duration::from_millis(20);
 
 /// What the control loop asks of the thread.
 pub(crate) enum Order {
@@ -76,22 +78,32 @@ struct State {
     board: Arc<Board>,
     shown: Time,
     datagrams: Vec<u8>,
+    /// Where small samples are copied to, each in its turn.
+    copied: Vec<u8>,
     spin: bool,
 }
 
-/// A sample held in place while its fragments leave.
+/// A sample on its way: a small one is copied twice within a call, a large one held in place while its fragments leave.
 #[derive(Clone)]
-struct Payload(Arc<RawGuard>);
+enum Payload {
+    Copied(Vec<u8>),
+    Held(Arc<RawGuard>),
+}
 
 /// One item under one contract, on its way out.
 struct Stream {
     key: WaitKey,
     limited: bool,
+    is_every: bool,
     newest: (Epoch, Seq),
     /// Where the newest sample lay, from which the places of others follow.
     cursor: Cursor,
     /// When the rate allows the next sample, if one is waiting for that.
     due: Option<Time>,
+    /// Since when samples wait in the store that no path had room for.
+    behind: Option<Time>,
+    /// Whether nothing more is read before a path asks.
+    paused: bool,
 }
 
 impl Tx {
@@ -121,6 +133,7 @@ impl Tx {
             board,
             shown: ddx_store::now(),
             datagrams: Vec::new(),
+            copied: Vec::new(),
             spin,
         };
         let thread = thread::Builder::new()
@@ -222,13 +235,19 @@ impl State {
                     Stream {
                         key,
                         limited,
+                        is_every: route.contract.delivery != Delivery::Latest,
                         newest: Default::default(),
                         cursor: Cursor::default(),
                         due: None,
+                        behind: None,
+                        paused: false,
                     },
                 );
             }
-            Order::Update { stream, route } => self.sender.update(stream, &route, now),
+            Order::Update { stream, route } => {
+                self.sender.update(stream, &route, now);
+                self.resume(stream);
+            }
             Order::Close(stream) => {
                 self.sender.close(stream);
                 if let Some(closed) = self.streams.remove(&stream) {
@@ -249,37 +268,54 @@ impl State {
         }
     }
 
-    /// Sends what a stream's item has that was not sent yet, as far as its rate allows.
+    /// Sends what a stream's item has that was not sent yet, as far as its rate and its paths allow.
     fn pull(&mut self, id: StreamId) {
         let Self {
             streams,
             set,
             sender,
+            copied,
             ..
         } = self;
-        let Some(stream) = streams.get_mut(&id) else {
+        let Some(stream) = streams.get_mut(&id).filter(|stream| !stream.paused) else {
             return;
         };
         let Some(reader) = set.reader(stream.key) else {
             return;
         };
+        let mut now = ddx_store::now();
+        let overdue = stream.behind.is_some_and(|b| now.since(b) > BEHIND_MAX);
+        let mut skips = overdue && !stream.is_every;
         for _turn in 0..SAMPLES_PER_TURN {
             if stream.limited {
-                if let Due::At(at) = sender.due(id, ddx_store::now()) {
+                now = ddx_store::now();
+                if let Due::At(at) = sender.due(id, now) {
                     stream.due = Some(at);
                     return;
                 }
                 stream.due = None;
             }
-            let read = if stream.limited {
-                reader.current_pinned()
+            let read = if stream.limited || std::mem::take(&mut skips) {
+                reader.take_current(copied)
             } else {
-                reader.next_pinned(Duration::ZERO)
+                reader.take_next(copied, Duration::ZERO)
             };
             match read {
-                Ok(Some(guard)) if stream.is_new(guard.meta()) => stream.write(id, guard, sender),
+                Ok(Some(taken)) if stream.is_new(taken.meta()) => {
+                    let has_room = stream.write(id, taken, sender, copied, now);
+                    // One that the contract keeps slow is offered at its rate all the same: what goes is the newest anyway.
+                    if !has_room && !stream.limited {
+                        stream.behind.get_or_insert(now);
+                        stream.paused = true;
+                        set.mute(stream.key);
+                        return;
+                    }
+                }
                 Ok(Some(_)) if !stream.limited => {}
-                Ok(_) => return,
+                Ok(_) => {
+                    stream.behind = None;
+                    return;
+                }
                 Err(error) => {
                     tracing::debug!(%error, stream = id.0, "reading an item to send");
                     return;
@@ -288,6 +324,16 @@ impl State {
         }
         // More is waiting: take the next turn at once, after the other items.
         set.mark(stream.key);
+    }
+
+    /// Reads on where a stream was left because its paths were full.
+    fn resume(&mut self, id: StreamId) {
+        if let Some(stream) = self.streams.get_mut(&id)
+            && std::mem::take(&mut stream.paused)
+        {
+            self.set.unmute(stream.key);
+            self.pull(id);
+        }
     }
 
     fn pull_due(&mut self, now: Time) {
@@ -308,11 +354,17 @@ impl State {
             let stream = self.streams.get_mut(&fetch.stream);
             let found = stream.and_then(|stream| {
                 let reader = self.set.reader(stream.key)?;
-                let guard = stream.find(&fetch, reader)?;
-                Some((sample_meta(guard.meta()), Payload(Arc::new(guard))))
+                let taken = stream.find(&fetch, reader, &mut self.copied)?;
+                let meta = sample_meta(taken.meta());
+                Some((meta, Payload::new(taken, &mut self.copied)))
             });
-            let found = found.as_ref().map(|(meta, payload)| (meta, payload));
-            self.sender.fetched(&fetch, found, ddx_store::now());
+            let now = ddx_store::now();
+            let given = found.as_ref().map(|(meta, payload)| (meta, payload));
+            self.sender.fetched(&fetch, given, now);
+            if let Some((_, payload)) = found {
+                payload.give_back(&mut self.copied);
+            }
+            self.resume(fetch.stream);
         }
     }
 
@@ -346,31 +398,55 @@ impl Stream {
         (meta.epoch, meta.seq) > self.newest
     }
 
-    fn write(&mut self, id: StreamId, guard: RawGuard, sender: &mut Sender<Payload>) {
-        let meta = sample_meta(guard.meta());
+    /// Offers a sample to the stream's paths; false when all of them are full.
+    fn write(
+        &mut self,
+        id: StreamId,
+        taken: Taken,
+        sender: &mut Sender<Payload>,
+        copied: &mut Vec<u8>,
+        now: Time,
+    ) -> bool {
+        let meta = sample_meta(taken.meta());
         self.newest = (meta.epoch, meta.seq);
-        self.cursor = guard.meta().cursor();
-        sender.write(id, &meta, &Payload(Arc::new(guard)), ddx_store::now());
+        self.cursor = taken.meta().cursor();
+        let payload = Payload::new(taken, copied);
+        let has_room = sender.write(id, &meta, &payload, now);
+        payload.give_back(copied);
+        has_room
     }
 
     /// The sample that is wanted, while the store has it.
-    fn find(&mut self, fetch: &Fetch, reader: &mut RawReader) -> Option<RawGuard> {
+    fn find(
+        &mut self,
+        fetch: &Fetch,
+        reader: &mut RawReader,
+        copied: &mut Vec<u8>,
+    ) -> Option<Taken> {
         let read = match fetch.want {
-            Want::Newest => reader.current_pinned(),
-            Want::After(epoch, seq) => reader.after_pinned(&self.cursor_of(epoch, seq)),
+            // Who reads on behind it must miss nothing: for these the newest is the last one that was offered.
+            Want::Newest if self.is_every && self.newest.1 > Seq(0) => {
+                let (epoch, Seq(seq)) = self.newest;
+                let before = self.cursor_of(epoch, Seq(seq.saturating_sub(1)));
+                reader.take_after(&before, copied)
+            }
+            Want::Newest => reader.take_current(copied),
+            Want::After(epoch, seq) => reader.take_after(&self.cursor_of(epoch, seq), copied),
             Want::At(epoch, Seq(seq)) => {
-                reader.after_pinned(&self.cursor_of(epoch, Seq(seq.saturating_sub(1))))
+                let before = self.cursor_of(epoch, Seq(seq.saturating_sub(1)));
+                reader.take_after(&before, copied)
             }
         };
         match read {
-            Ok(guard) => {
-                if let Some(guard) = &guard
-                    && self.is_new(guard.meta())
+            Ok(taken) => {
+                if let Some(meta) = taken.as_ref().map(Taken::meta)
+                    && !self.limited
+                    && self.is_new(meta)
                 {
-                    self.newest = (guard.meta().epoch, guard.meta().seq);
-                    self.cursor = guard.meta().cursor();
+                    self.newest = (meta.epoch, meta.seq);
+                    self.cursor = meta.cursor();
                 }
-                guard
+                taken
             }
             Err(error) => {
                 tracing::debug!(%error, stream = fetch.stream.0, "reading an item to send");
@@ -398,9 +474,28 @@ impl Stream {
     }
 }
 
+impl Payload {
+    /// Borrows the buffer of copies until it is given back.
+    fn new(taken: Taken, copied: &mut Vec<u8>) -> Self {
+        match taken {
+            Taken::Copied(_) => Self::Copied(std::mem::take(copied)),
+            Taken::Held(guard) => Self::Held(Arc::new(guard)),
+        }
+    }
+
+    fn give_back(self, copied: &mut Vec<u8>) {
+        if let Self::Copied(bytes) = self {
+            *copied = bytes;
+        }
+    }
+}
+
 impl AsRef<[u8]> for Payload {
     fn as_ref(&self) -> &[u8] {
-        self.0.bytes()
+        match self {
+            Self::Copied(bytes) => bytes,
+            Self::Held(guard) => guard.bytes(),
+        }
     }
 }
 

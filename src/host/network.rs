@@ -31,9 +31,11 @@ use crate::net::{self, Channel, Interface, Members, Outlets, Sockets, Watch};
 const NOTICES: usize = 4096;
 /// Datagrams taken from one socket before the loop looks at anything else.
 const DATAGRAMS_PER_TURN: usize = 64;
-/// Samples that a mirror holds where each one is wanted, and bytes that these may take.
+/// Samples that a mirror holds where each one is wanted.
 const EVERY_DEPTH: u32 = 1_024;
-const EVERY_BYTES: u32 = 64 << 20;
+/// Most samples that a mirror holds, whatever its owner's ring does, and bytes that these may take.
+const MIRROR_DEPTH: u32 = 16_384;
+const MIRROR_BYTES: u32 = 64 << 20;
 /// Samples of one item that the sending thread may hold in place, beyond the two of every reader.
 const TX_PINS: u32 = 6;
 /// Larger than any control datagram.
@@ -612,6 +614,7 @@ impl Network {
         let fits = |mirror: &Mirror| {
             mirror.description.schema_hash == description.schema_hash
                 && mirror.description.capacity_bytes == description.capacity_bytes
+                && mirror.description.depth == description.depth
         };
         if self.mirrors.get(name).is_some_and(|mirror| !fits(mirror)) {
             self.drop_mirror(name)?;
@@ -654,15 +657,19 @@ impl Network {
             schema.hash() == description.schema_hash,
             "its owner's schema is not the one announced"
         );
-        let mut options = WriterOptions {
-            capacity_bytes: Some(description.capacity_bytes),
-            ..WriterOptions::default()
+        let default = WriterOptions::default();
+        // What waits for its readers at its owner's waits for those of this host too; and where each sample is wanted, what
+        // comes in a burst of repairs.
+        let depth = match contract.delivery {
+            Delivery::Latest => description.depth,
+            Delivery::Every | Delivery::EveryFromRing => description.depth.max(EVERY_DEPTH),
         };
-        if contract.delivery != Delivery::Latest {
-            // What comes in a burst of repairs must wait for the readers of this host.
-            let fits = EVERY_BYTES / description.capacity_bytes.max(1);
-            options.depth = fits.clamp(options.depth, EVERY_DEPTH);
-        }
+        let fits = MIRROR_BYTES / description.capacity_bytes.max(1);
+        let options = WriterOptions {
+            capacity_bytes: Some(description.capacity_bytes),
+            depth: depth.min(fits).clamp(default.depth, MIRROR_DEPTH),
+            ..default
+        };
         let writer = self.store.raw_writer(name.as_str(), &schema, options)?;
         self.last_mirror += 1;
         let id = MirrorId(self.last_mirror);

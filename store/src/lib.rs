@@ -92,7 +92,7 @@ pub use clock::now;
 pub use control::{Description, ItemEntry, Newest, ReaderEntry, Refusal, SCHEMA_MAX_BYTES};
 pub use error::Error;
 pub use quota::{Limit, Quotas};
-pub use reader::{From, Guard, RawGuard, RawReader, Reader, ReaderOptions};
+pub use reader::{From, Guard, RawGuard, RawReader, Reader, ReaderOptions, Taken};
 pub use sample::{After, Age, Cursor, Meta, Missed, Sample};
 pub use segment::{Origin, ReaderBooks};
 pub use store::{Options, Store};
@@ -104,5 +104,6 @@ pub mod item;
 pub mod schema;
 
 pub use ddx_derive::Item;
+pub use ddx_wire::{Delivery, Priority};
 pub use item::{Item, Plain, Typed};
 pub use schema::{Encoding, Schema, SchemaError};

@@ -92,6 +92,15 @@ pub struct RawGuard {
     _seat: Arc<Registered>,
 }
 
+/// A sample taken in the cheaper way: a few bytes copied, more of them held in place.
+#[derive(Debug)]
+pub enum Taken {
+    /// Its bytes are in the payload that was passed.
+    Copied(Meta),
+    /// Its bytes are in the guard.
+    Held(RawGuard),
+}
+
 /// A reader's place in the present segment.
 #[derive(Debug)]
 struct Bound {
@@ -365,6 +374,48 @@ impl RawReader {
         Ok(read.map(|(pin, meta)| self.guard(pin, meta)))
     }
 
+    /// Takes the newest sample like [`RawReader::take_next`], at once; none before the first.
+    pub fn take_current(&mut self, payload: &mut Vec<u8>) -> Result<Option<Taken>, Error> {
+        self.look()?;
+        let Some(Bound { segment, .. }) = &self.bound else {
+            return Ok(None);
+        };
+        let mut copier = Copier::new(payload);
+        match segment.newest(|pos| take(&mut copier, segment, pos)) {
+            Ok(taken) => {
+                let meta = self.see(taken_stamp(&taken));
+                Ok(Some(self.taken(taken, meta)))
+            }
+            Err(PinError::NotYet) => Ok(None),
+            Err(error) => Err(pin_error(error, segment)),
+        }
+    }
+
+    /// Like [`RawReader::next_into`] for small samples, which it copies into `payload`, and [`RawReader::next_pinned`] for
+    /// others: for who takes many and keeps few.
+    pub fn take_next(
+        &mut self,
+        payload: &mut Vec<u8>,
+        timeout: Duration,
+    ) -> Result<Option<Taken>, Error> {
+        let mut copier = Copier::new(payload);
+        let read = |segment: &SegmentReader, pos| take(&mut copier, segment, pos);
+        let read = self.next_with(timeout, read, |taken| *taken_stamp(taken))?;
+        Ok(read.map(|(taken, meta)| self.taken(taken, meta)))
+    }
+
+    /// Takes the oldest sample after `cursor` that is still there like [`RawReader::take_next`], at once.
+    pub fn take_after(
+        &mut self,
+        cursor: &Cursor,
+        payload: &mut Vec<u8>,
+    ) -> Result<Option<Taken>, Error> {
+        let mut copier = Copier::new(payload);
+        let read = |segment: &SegmentReader, pos| take(&mut copier, segment, pos);
+        let read = self.after_with(cursor, read, |taken| *taken_stamp(taken))?;
+        Ok(read.map(|(taken, meta)| self.taken(taken, meta)))
+    }
+
     /// The item's name.
     pub fn name(&self) -> &ItemName {
         &self.seat.name
@@ -526,6 +577,13 @@ impl RawReader {
                 lost,
                 ..self.books
             });
+        }
+    }
+
+    fn taken(&self, taken: Result<Stamp, Pin>, meta: Meta) -> Taken {
+        match taken {
+            Ok(_copied) => Taken::Copied(meta),
+            Err(pin) => Taken::Held(self.guard(pin, meta)),
         }
     }
 
@@ -721,6 +779,16 @@ impl RawGuard {
     }
 }
 
+impl Taken {
+    /// Where the sample comes from.
+    pub fn meta(&self) -> &Meta {
+        match self {
+            Self::Copied(meta) => meta,
+            Self::Held(guard) => guard.meta(),
+        }
+    }
+}
+
 impl Drop for Registered {
     fn drop(&mut self) {
         self.connection.close(self.handle);
@@ -748,6 +816,25 @@ impl Wait for RawReader {
 impl<T> Wait for Reader<T> {
     fn raw(&mut self) -> &mut RawReader {
         &mut self.raw
+    }
+}
+
+/// Copies the sample at `pos` if it is small, and pins it otherwise.
+fn take(
+    copier: &mut Copier<'_>,
+    segment: &SegmentReader,
+    pos: u64,
+) -> Result<Result<Stamp, Pin>, PinError> {
+    match copier.copy_small(segment, pos)? {
+        true => Ok(Ok(copier.stamp())),
+        false => segment.pin(pos).map(Err),
+    }
+}
+
+fn taken_stamp(taken: &Result<Stamp, Pin>) -> &Stamp {
+    match taken {
+        Ok(stamp) => stamp,
+        Err(pin) => pin.stamp(),
     }
 }
 

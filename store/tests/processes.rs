@@ -19,7 +19,7 @@ use std::time::Duration;
 use ddx_store::server::Event;
 use ddx_store::{
     Cursor, Error, From, ItemEntry, Missed, Origin, Quotas, ReaderOptions, Refusal, Schema, Store,
-    WriterOptions, wait_any,
+    Taken, WriterOptions, wait_any,
 };
 use ddx_wire::{Contract, Epoch, HostName, Pattern, Seq, Time, WriterState};
 use rig::{Daemon, Dir, LONG, NONE, Process};
@@ -612,6 +612,36 @@ fn handles_are_of_no_use_after_a_fork() {
     writer.write(&3).unwrap();
     assert_eq!(reader.current().unwrap().unwrap().value, 3);
     assert_eq!(store.describe("n").unwrap().readers.len(), 1);
+}
+
+#[test]
+fn who_takes_samples_gets_small_ones_as_copies_and_large_ones_in_place() {
+    let daemon = Daemon::start(Quotas::default());
+    let store = daemon.store();
+    let options = WriterOptions {
+        capacity_bytes: Some(4_096),
+        ..WriterOptions::default()
+    };
+    let schema = Schema::bytes();
+    let mut writer = store.raw_writer("n", &schema, options).unwrap();
+    let mut reader = store
+        .raw_reader("n", None, ReaderOptions::default())
+        .unwrap();
+    let (small, large) = ([1; 64], [2; 4_096]);
+    writer.write(&small).unwrap();
+    writer.write(&large).unwrap();
+
+    let mut payload = Vec::new();
+    let first = reader.take_current(&mut payload).unwrap();
+    assert!(matches!(&first, Some(Taken::Held(guard)) if *guard.bytes() == large));
+    let after = reader.take_after(&Cursor::default(), &mut payload).unwrap();
+    assert!(matches!(after, Some(Taken::Copied(meta)) if meta.pos == 1));
+    assert_eq!(payload, small);
+    writer.write(&small).unwrap();
+    payload.clear();
+    let next = reader.take_next(&mut payload, LONG).unwrap();
+    assert!(matches!(next, Some(Taken::Copied(meta)) if meta.pos == 3));
+    assert_eq!(payload, small);
 }
 
 #[test]

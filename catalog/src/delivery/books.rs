@@ -39,7 +39,7 @@ pub struct Books {
 pub struct SourceBooks {
     /// Samples from the first one that was offered to the newest, over all epochs, by their numbers.
     pub expected: u64,
-    /// Offered to every way of the stream.
+    /// Offered to every way of the stream, or passed over while none of them had room.
     pub delivered: u64,
     /// Left out because the contract asks for fewer.
     pub rate_limited: u64,

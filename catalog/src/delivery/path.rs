@@ -350,6 +350,15 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         }
     }
 
+    /// Something newer than what was offered here lies in the store.
+    pub(super) fn wait(&mut self, stream: StreamId, now: Time) {
+        self.forget_turns(stream);
+        if let Some(flow) = self.flows.get_mut(&stream) {
+            flow.waits.get_or_insert(now);
+        }
+        self.take_turns(stream);
+    }
+
     /// Whether samples of a stream wait in the store for their turn.
     pub(super) fn waits(&self, stream: StreamId) -> bool {
         let flow = self.flows.get(&stream);

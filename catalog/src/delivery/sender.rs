@@ -12,7 +12,7 @@ use ddx_wire::{Delivery, Epoch, Seq, StreamId, Tag, Time};
 use super::books::{SentBooks, SourceBooks};
 use super::deadlines::Deadlines;
 use super::path::{Offered, Path, PathLimits};
-use super::stream::Stream;
+use super::stream::{Reader, Stream};
 use super::{
     Due, Fetch, PathStatus, Route, SenderEvent, TimerName, Transmit, Via, group_number, key,
 };
@@ -124,6 +124,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             counters: StreamCounters::default(),
             books: SourceBooks::default(),
             offered: None,
+            full: false,
         });
         let before = std::mem::take(&mut stream.destinations);
         stream.reroute(route, now);
@@ -184,19 +185,20 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         }
     }
 
-    /// Offers a new sample to every path of its stream. One that is not newer than the last is ignored.
+    /// Offers a new sample to every path of its stream. One that is not newer than the last is ignored. Returns false when
+    /// every path is full, so that it is of no use to offer more before one of them asks.
     ///
     /// A path that is full takes it later, by a [`SenderEvent::Fetch`], or a newer one instead. The driver keeps the
     /// contract's rate by asking [`Sender::due`] first. One over 64 MiB is dropped and counted, and one of a stream that is
     /// not open is ignored.
-    pub fn write(&mut self, id: StreamId, meta: &SampleMeta, payload: &P, now: Time) {
+    pub fn write(&mut self, id: StreamId, meta: &SampleMeta, payload: &P, now: Time) -> bool {
         self.now = now;
         let Some(stream) = self.streams.get_mut(&id) else {
-            return;
+            return true;
         };
         let newest = Some(key(meta));
         if newest <= stream.newest {
-            return;
+            return true;
         }
         let admitted = stream.admits(meta, payload.as_ref(), now);
         stream.account(meta, payload.as_ref(), admitted);
@@ -210,20 +212,24 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
                     }
                 }
             }
-            return;
+            return true;
         }
         let meta = &stream.advance(meta);
         stream.counters.sent += 1;
         stream.advance_due(now);
-        let mut gone = Vec::new();
+        let (mut taken, mut refused) = (false, false);
         for to in &stream.destinations {
             let Some(path) = self.paths.get_mut(to) else {
                 continue;
             };
             match path.offer(id, meta, payload, now) {
                 // Large ones are noted again when they have left in full.
-                Offered::Goes | Offered::Begins => gone.push(*to),
+                Offered::Goes | Offered::Begins => {
+                    taken = true;
+                    note_sent(&mut stream.readers, *to, key(meta), false, now);
+                }
                 Offered::Waits => {
+                    refused = true;
                     stream.counters.deferred += 1;
                     self.hungry.insert(*to);
                 }
@@ -233,19 +239,41 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             }
             enlist(&mut self.ready, &self.blocked, *to);
         }
-        for to in gone {
-            self.note_sent(id, to, key(meta), false);
+        if taken {
+            self.repeats.set_if_idle(id, now + REPEAT_FIRST);
         }
+        stream.full = refused && !taken;
+        !stream.full
     }
 
     /// Takes what a [`SenderEvent::Fetch`] asked for, or that the store has nothing like it.
+    ///
+    /// Of a stream without a rate, one that is newer than the last that was offered is offered thereby: the driver does not
+    /// write it, and the other paths fetch it, or a newer one.
     pub fn fetched(&mut self, fetch: &Fetch, found: Option<(&SampleMeta, &P)>, now: Time) {
         self.now = now;
         let Some(stream) = self.streams.get_mut(&fetch.stream) else {
             return;
         };
         let admitted = found.is_none_or(|(meta, p)| stream.admits(meta, p.as_ref(), now));
-        let found = found.map(|(meta, payload)| (stream.complete(meta), payload));
+        let newest = stream.newest.filter(|_| stream.interval().is_zero());
+        let new = found.filter(|(meta, _)| newest.is_some_and(|newest| newest < key(meta)));
+        if let Some((meta, payload)) = new {
+            stream.account(meta, payload.as_ref(), admitted);
+        }
+        let found = found.map(|(meta, payload)| match new {
+            Some(_) if admitted => (stream.advance(meta), payload),
+            Some(_) | None => (stream.complete(meta), payload),
+        });
+        if new.is_some() && admitted {
+            stream.counters.sent += 1;
+            for to in stream.destinations.iter().filter(|to| **to != fetch.to) {
+                if let Some(path) = self.paths.get_mut(to) {
+                    path.wait(fetch.stream, now);
+                    self.hungry.insert(*to);
+                }
+            }
+        }
         if found.is_some() && admitted && fetch.again {
             stream.counters.repeats += 1;
         }
@@ -528,17 +556,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         let Some(stream) = self.streams.get_mut(&id) else {
             return;
         };
-        for reader in &mut stream.readers {
-            if !reader.host.is_reached_by(to) {
-                continue;
-            }
-            if Some(at) > reader.sent {
-                reader.sent = Some(at);
-                (reader.sent_at, reader.repeats) = (now, 0);
-            } else if in_full && Some(at) == reader.sent {
-                reader.sent_at = now;
-            }
-        }
+        note_sent(&mut stream.readers, to, at, in_full, now);
         if !stream.readers.is_empty() {
             self.repeats.set_if_idle(id, now + REPEAT_FIRST);
         }
@@ -642,6 +660,21 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
     fn first_repeat_after(&self, tag: Tag) -> Duration {
         let round_trip = self.round_trips.get(&tag).copied();
         REPEAT_FIRST + round_trip.unwrap_or(ROUND_TRIP_UNKNOWN)
+    }
+}
+
+/// Takes note that those who are reached by a path may confirm a sample from now on.
+fn note_sent(readers: &mut [Reader], to: SocketAddr, at: (Epoch, Seq), in_full: bool, now: Time) {
+    for reader in readers {
+        if !reader.host.is_reached_by(to) {
+            continue;
+        }
+        if Some(at) > reader.sent {
+            reader.sent = Some(at);
+            (reader.sent_at, reader.repeats) = (now, 0);
+        } else if in_full && Some(at) == reader.sent {
+            reader.sent_at = now;
+        }
     }
 }
 

@@ -25,6 +25,8 @@ pub(super) struct Stream {
     pub(super) books: SourceBooks,
     /// Newest sample that was offered, whatever became of it.
     pub(super) offered: Option<(Epoch, Seq)>,
+    /// Whether no way had room for the newest: what the driver does not offer meanwhile, each way leaves out for itself.
+    pub(super) full: bool,
 }
 
 #[derive(Debug)]
@@ -84,9 +86,12 @@ impl Stream {
             return;
         };
         self.offered = Some(key(meta));
+        let left_to_ways = self.leaves_out_by_way();
         let books = &mut self.books;
         books.expected = books.expected.saturating_add(ahead);
-        let missed = if self.contract.interval_ns() > 0 {
+        let missed = if left_to_ways {
+            &mut books.delivered
+        } else if self.contract.interval_ns() > 0 {
             &mut books.rate_limited
         } else {
             &mut books.overwritten
@@ -117,6 +122,7 @@ impl Stream {
         let filtered = match self.newest {
             // What is left out of these is told one by one.
             _ if self.contract.delivery != Delivery::Latest => 0,
+            Some((last, _)) if last == epoch && self.leaves_out_by_way() => self.filtered,
             Some((last, Seq(from))) if last == epoch => {
                 let skipped = seq.saturating_sub(from).saturating_sub(1);
                 self.filtered.saturating_add(skipped)
@@ -127,6 +133,12 @@ impl Stream {
             filtered: filtered.min(seq.saturating_sub(1)),
             ..*meta
         }
+    }
+
+    /// Whether a sample that is not offered now is one for which no way had room, rather than one that the contract or the
+    /// ring left out.
+    fn leaves_out_by_way(&self) -> bool {
+        self.full && self.contract.delivery == Delivery::Latest && self.contract.interval_ns() == 0
     }
 
     pub(super) fn advance_due(&mut self, now: Time) {

@@ -132,6 +132,60 @@ fn feed(receiver: &mut Receiver, datagrams: &[Vec<u8>], now: Time) -> Vec<(Epoch
 }
 
 #[test]
+fn a_full_path_says_so_and_asks_for_the_next_once_it_has_room() {
+    let mut sender = sender(Via::Unicast, 1);
+    let now = Time(0) + Duration::from_secs(1);
+    let offered = (1..10_000).find(|seq| {
+        let payload = payload(1, *seq, 64);
+        !sender.write(STREAM, &meta(1, *seq), &payload, now)
+    });
+    // 4 ms of a path's rate are less than 10,000 samples.
+    let refused = offered.unwrap();
+    sender.flush(now);
+    drain(&mut sender);
+    sender.handle_timeout(now + 5 * MS);
+    drain(&mut sender);
+    let wanted = Fetch {
+        stream: STREAM,
+        to: address(0),
+        want: Want::After(Epoch(1), Seq(refused - 1)),
+        again: false,
+    };
+    assert_eq!(sender.poll_event(), Some(SenderEvent::Fetch(wanted)));
+    let found = (meta(1, refused), payload(1, refused, 64));
+    sender.fetched(&wanted, Some((&found.0, &found.1)), now + 5 * MS);
+    // What the driver passed over meanwhile this way left out, and not the source for all.
+    let next = payload(1, refused + 9, 64);
+    assert!(sender.write(STREAM, &meta(1, refused + 9), &next, now + 5 * MS));
+    let (_, source) = sender.source_books().next().unwrap();
+    assert_eq!(
+        (source.expected, source.delivered),
+        (refused + 9, refused + 9)
+    );
+    let (_, _, sent) = sender.sent_books().next().unwrap();
+    assert_eq!((sent.delivered, sent.queue_dropped), (refused + 1, 8));
+}
+
+#[test]
+fn what_one_path_fetches_before_it_was_offered_the_others_ask_for() {
+    let mut sender = sender(Via::Group(group()), 1);
+    write(&mut sender, 1, 10, Time(0));
+    sender.update(STREAM, &route(Via::Group(group()), 2), Time(0));
+    let Some(SenderEvent::Fetch(fetch)) = sender.poll_event() else {
+        panic!("the new reader gets nothing");
+    };
+    assert_eq!((fetch.to, fetch.want), (address(1), Want::Newest));
+    sender.fetched(&fetch, Some((&meta(1, 3), &b"x".to_vec())), Time(0));
+    let wanted = Fetch {
+        stream: STREAM,
+        to: group(),
+        want: Want::After(Epoch(1), Seq(1)),
+        again: false,
+    };
+    assert_eq!(sender.poll_event(), Some(SenderEvent::Fetch(wanted)));
+}
+
+#[test]
 fn samples_of_one_destination_share_a_datagram() {
     let mut sender = sender(Via::Unicast, 1);
     for seq in 1..=20 {

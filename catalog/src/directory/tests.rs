@@ -11,6 +11,7 @@ fn description(rest: &str) -> ItemDescription {
         name: ItemName::parse(rest, &HostName::parse("r").unwrap()).unwrap(),
         schema_hash: SchemaHash([1; 16]),
         capacity_bytes: 8,
+        depth: 8,
         epoch: Epoch(1),
         writer: WriterState::Live,
         program: "p".to_owned(),

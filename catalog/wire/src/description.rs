@@ -30,6 +30,8 @@ pub struct ItemDescription {
     pub schema_hash: SchemaHash,
     /// Largest payload, bytes.
     pub capacity_bytes: u32,
+    /// Samples that its ring holds.
+    pub depth: u32,
     /// Tenure of the present or last writer.
     pub epoch: Epoch,
     /// Who writes it.

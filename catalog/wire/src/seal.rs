@@ -267,7 +267,7 @@ mod tests {
         let shown: String = datagram.iter().map(|b| format!("{b:02x}")).collect();
         assert_eq!(
             shown,
-            "0103ba684d0000005b9f930c0e7a414f00000000000000009d84ff969ce0f71e3e4fd23a50519ebff03e5a"
+            "0203ba684d0000005b9f930c0e7a414f00000000000000009d84ff8b6f2dd00f68c69211bedb5dabb0603f"
         );
     }
 

@@ -174,7 +174,11 @@ impl SegmentReader {
         Ok(copier.stamp())
     }
 
-    fn newest<T>(&self, mut read: impl FnMut(u64) -> Result<T, PinError>) -> Result<T, PinError> {
+    /// Reads the newest sample; tries again while the writer overtakes it.
+    pub(crate) fn newest<T>(
+        &self,
+        mut read: impl FnMut(u64) -> Result<T, PinError>,
+    ) -> Result<T, PinError> {
         // A ring of depth 1 under a writer at full speed overtakes a reader a few times in a row, never this often.
         const TRIES: u32 = 1000;
         for _ in 0..TRIES {
@@ -262,6 +266,12 @@ impl<'a> Copier<'a> {
                 Err(error)
             }
         }
+    }
+
+    /// Copies the sample at `pos` if it is small enough to be copied without a pin; whether it was.
+    #[inline]
+    pub fn copy_small(&mut self, segment: &SegmentReader, pos: u64) -> Result<bool, PinError> {
+        self.glance(&segment.seated, pos)
     }
 
     /// Copies the newest sample like [`SegmentReader::copy_newest`].

@@ -744,6 +744,7 @@ fn change(input: &mut Input<'_>) -> Change {
         _ => ItemState::Announced(ItemDescription {
             schema_hash: hash(input),
             capacity_bytes: input.word(),
+            depth: input.word(),
             ..description(&name, Epoch(input.number()))
         }),
     };
@@ -799,6 +800,7 @@ fn description(name: &ItemName, epoch: Epoch) -> ItemDescription {
         name: name.clone(),
         schema_hash: SchemaHash([1; 16]),
         capacity_bytes: 8,
+        depth: 8,
         epoch,
         writer: WriterState::Live,
         program: "fuzz".to_owned(),

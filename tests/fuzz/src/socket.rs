@@ -469,6 +469,7 @@ fn remote(input: &mut Input<'_>) -> RemoteItem {
             name,
             schema_hash: SchemaHash([1; 16]),
             capacity_bytes: input.word(),
+            depth: input.word(),
             epoch: Epoch(input.number()),
             writer: WriterState::Live,
             program: String::from_utf8_lossy(input.bytes(64)).into_owned(),

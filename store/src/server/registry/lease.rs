@@ -296,6 +296,7 @@ impl Registry {
         let is_same_kind = former.as_ref().is_some_and(|former| {
             former.schema == tenure.schema
                 && former.segment.control.spec().capacity_bytes == spec.capacity_bytes
+                && former.segment.control.spec().depth == spec.depth
         });
         let mut told = Vec::new();
         for at in 0..item.readers.len() {
@@ -478,10 +479,12 @@ impl Registry {
             return None;
         }
         let tenure = self.items.get(name)?.tenure.as_ref()?;
+        let spec = tenure.segment.control.spec();
         Some(ItemDescription {
             name: name.clone(),
             schema_hash: tenure.schema.hash(),
-            capacity_bytes: tenure.segment.control.spec().capacity_bytes,
+            capacity_bytes: spec.capacity_bytes,
+            depth: spec.depth,
             epoch: tenure.segment.control.epoch(),
             writer: tenure.state,
             program: tenure.program.clone(),

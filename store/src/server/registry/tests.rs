@@ -249,6 +249,7 @@ fn a_description_fits_one_message_whatever_others_have_said() {
             name: far,
             schema_hash: SchemaHash::default(),
             capacity_bytes: 8,
+            depth: 8,
             epoch: Epoch(1),
             writer: WriterState::Live,
             program: "p".to_owned(),

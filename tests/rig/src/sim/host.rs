@@ -264,6 +264,7 @@ impl Host {
             name: name.clone(),
             schema_hash: SchemaHash([1; 16]),
             capacity_bytes: 65_536,
+            depth: 8,
             epoch: data.store.open_writer(name, data.ordinal),
             writer: WriterState::Live,
             program: "sim".to_owned(),
@@ -468,7 +469,7 @@ impl Data {
     fn obey(&mut self, order: Order, now: Time) {
         match order {
             Order::Open(stream, item, route, seen) => self.tx.open(stream, item, &route, seen, now),
-            Order::Update(stream, route) => self.tx.sender.update(stream, &route, now),
+            Order::Update(stream, route) => self.tx.update(stream, &route, now),
             Order::Close(stream) => self.tx.close(stream),
             Order::Held(stream, tag, epoch, seq) => {
                 self.tx.sender.held(stream, tag, epoch, seq, now);

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use ddx_catalog::delivery::{Due, Route, Sender, SenderConfig, SenderEvent, Want};
 use ddx_wire::seal::{MAX_DATAGRAM_BYTES, Sealer};
-use ddx_wire::{Epoch, ItemName, Seq, StreamId, Time};
+use ddx_wire::{Delivery, Epoch, ItemName, Seq, StreamId, Time};
 
 use super::store::Store;
 
@@ -31,11 +32,19 @@ pub struct Counts {
     pub bytes: u64,
 }
 
+/// A stream that was behind its paths for so long goes on with its newest sample, unless each one is wanted.
+const BEHIND_MAX: Duration = Duration::from_millis(20);
+
 struct Stream {
     item: ItemName,
     limited: bool,
+    is_every: bool,
     newest: (Epoch, Seq),
     due: Option<Time>,
+    /// Since when samples wait in the store that no path had room for.
+    behind: Option<Time>,
+    /// Whether nothing more is read before a path asks.
+    paused: bool,
     /// Position of the last sample that was read.
     seen: u64,
 }
@@ -66,12 +75,22 @@ impl Tx {
         let stream = Stream {
             item,
             limited: route.contract.interval_ns() > 0,
+            is_every: route.contract.delivery != Delivery::Latest,
             newest: Default::default(),
             due: None,
+            behind: None,
+            paused: false,
             seen,
         };
         self.sender.open(id, route, now);
         self.streams.insert(id, stream);
+    }
+
+    pub(super) fn update(&mut self, id: StreamId, route: &Route, now: Time) {
+        self.sender.update(id, route, now);
+        if let Some(stream) = self.streams.get_mut(&id) {
+            stream.paused = false;
+        }
     }
 
     pub(super) fn close(&mut self, id: StreamId) {
@@ -111,13 +130,15 @@ impl Tx {
     }
 
     fn pull(&mut self, id: StreamId, store: &Store, now: Time) {
-        let Some(stream) = self.streams.get_mut(&id) else {
+        let Some(stream) = self.streams.get_mut(&id).filter(|stream| !stream.paused) else {
             return;
         };
         let Some(item) = store.get(&stream.item) else {
             stream.due = None;
             return;
         };
+        let overdue = stream.behind.is_some_and(|b| now.since(b) > BEHIND_MAX);
+        let mut skips = overdue && !stream.is_every;
         loop {
             if stream.limited {
                 if let Due::At(at) = self.sender.due(id, now) {
@@ -126,44 +147,68 @@ impl Tx {
                 }
                 stream.due = None;
             }
-            let sample = if stream.limited {
+            let sample = if stream.limited || std::mem::take(&mut skips) {
                 item.current()
             } else {
                 item.next(stream.seen)
             };
             let Some(sample) = sample else {
+                stream.behind = None;
                 return;
             };
-            stream.seen = sample.pos;
+            stream.seen = stream.seen.max(sample.pos);
             let at = (sample.meta.epoch, sample.meta.seq);
             if at > stream.newest {
                 stream.newest = at;
-                self.sender.write(id, &sample.meta, &sample.payload, now);
+                let has_room = self.sender.write(id, &sample.meta, &sample.payload, now);
                 self.counts.writes += 1;
                 self.sent.push(stream.item.clone());
+                if !has_room && !stream.limited {
+                    stream.behind.get_or_insert(now);
+                    stream.paused = true;
+                    return;
+                }
             } else if stream.limited {
                 return;
             }
         }
     }
 
+    /// Reads on where a stream was left because its paths were full.
+    fn resume(&mut self, id: StreamId, store: &Store, now: Time) {
+        if let Some(stream) = self.streams.get_mut(&id)
+            && std::mem::take(&mut stream.paused)
+        {
+            self.pull(id, store, now);
+        }
+    }
+
     fn fetch(&mut self, store: &Store, now: Time) {
         while let Some(SenderEvent::Fetch(fetch)) = self.sender.poll_event() {
-            let Some(stream) = self.streams.get(&fetch.stream) else {
+            let Some(stream) = self.streams.get_mut(&fetch.stream) else {
                 continue;
             };
             let item = store.get(&stream.item);
             let sample = item.and_then(|item| match fetch.want {
+                Want::Newest if stream.is_every && stream.newest.1 > Seq(0) => {
+                    item.first_from(stream.newest.0, stream.newest.1)
+                }
                 Want::Newest => item.current(),
                 Want::After(epoch, seq) => item.first_from(epoch, Seq(seq.0 + 1)),
                 Want::At(epoch, seq) => item.first_from(epoch, seq),
             });
             let found = sample.map(|sample| (&sample.meta, &sample.payload));
             self.sender.fetched(&fetch, found, now);
-            if sample.is_some() {
+            if let Some(sample) = sample {
                 self.counts.repeats += u64::from(fetch.again);
                 self.sent.push(stream.item.clone());
+                let at = (sample.meta.epoch, sample.meta.seq);
+                if at > stream.newest && !stream.limited {
+                    stream.newest = at;
+                    stream.seen = stream.seen.max(sample.pos);
+                }
             }
+            self.resume(fetch.stream, store, now);
         }
     }
 }

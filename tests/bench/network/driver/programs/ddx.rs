@@ -1,14 +1,15 @@
-//! ddx: an item for each size, so that a size that is refused takes no other along.
+//! ddx: an item for each size, so that a size that is refused takes no other along. Its ring, which is its only queue, holds
+//! what the sockets of the peers do.
 
 use std::any::Any;
 use std::thread;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
-use ddx_store::{RawReader, RawWriter, ReaderOptions, Schema, Store, WriterOptions};
+use anyhow::{Context, Result};
+use ddx_store::{Delivery, RawReader, RawWriter, ReaderOptions, Schema, Store, WriterOptions};
 
 use crate::PUBLISHER;
-use crate::program::{Contender, Options, Publisher, Sink};
+use crate::program::{Contender, Options, Publisher, SOCKET_BUFFER_BYTES, Sink};
 
 pub(crate) struct Ddx;
 
@@ -16,15 +17,17 @@ struct Writers(Vec<(usize, Vec<RawWriter>)>);
 
 impl Contender for Ddx {
     fn publisher(&self, options: &Options) -> Result<Box<dyn Publisher>> {
-        refuse_reliable(options)?;
         let store = store()?;
         let mut all = Vec::new();
         for &size in &options.sizes {
             let mut writers = Vec::new();
             for item in 0..options.items {
+                let default = WriterOptions::default();
+                let queue = u32::try_from(SOCKET_BUFFER_BYTES / size)?;
                 let layout = WriterOptions {
                     capacity_bytes: Some(u32::try_from(size)?),
-                    ..WriterOptions::default()
+                    depth: queue.clamp(default.depth, DEPTH_MAX),
+                    ..default
                 };
                 writers.push(store.raw_writer(&name(size, item), &Schema::bytes(), layout)?);
             }
@@ -34,13 +37,18 @@ impl Contender for Ddx {
     }
 
     fn subscribe(&self, options: &Options, sink: Sink) -> Result<Box<dyn Any>> {
-        refuse_reliable(options)?;
         let store = store()?;
         for &size in &options.sizes {
             for item in 0..options.items {
                 let name = format!("{PUBLISHER}/{}", name(size, item));
-                let reader =
-                    store.raw_reader(&name, Some(&Schema::bytes()), ReaderOptions::default())?;
+                let how = ReaderOptions {
+                    delivery: match options.reliable {
+                        true => Delivery::Every,
+                        false => Delivery::Latest,
+                    },
+                    ..ReaderOptions::default()
+                };
+                let reader = store.raw_reader(&name, Some(&Schema::bytes()), how)?;
                 let sink = sink.clone();
                 thread::spawn(move || read(reader, &sink));
             }
@@ -90,11 +98,6 @@ fn name(size: usize, item: usize) -> String {
     format!("bench-{size}-{item}")
 }
 
-fn refuse_reliable(options: &Options) -> Result<()> {
-    if options.reliable {
-        bail!("ddx does not deliver every sample yet");
-    }
-    Ok(())
-}
-
+/// Most samples that a ring holds.
+const DEPTH_MAX: u32 = 16_384;
 const PATIENCE: Duration = Duration::from_secs(10);
