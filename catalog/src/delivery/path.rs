@@ -53,6 +53,7 @@ pub(super) struct Path<P> {
     unreported_bytes: usize,
     unreported_since: Time,
     probe_at: Time,
+    probes: usize,
     /// Who holds what of the streams is known by the sender; large samples that left in full are told to it.
     left: Vec<(StreamId, Epoch, Seq)>,
 }
@@ -100,6 +101,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             unreported_bytes: 0,
             unreported_since: now,
             probe_at: now,
+            probes: 0,
             left: Vec::new(),
         }
     }
@@ -751,7 +753,9 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         if self.number < FIRST_UNICAST || now < self.probe_at {
             return;
         }
-        self.probe_at = now + PROBE_PAUSE;
+        let pause = PROBE_PAUSES.get(self.probes).copied();
+        self.probe_at = now + pause.unwrap_or(PROBE_PAUSE);
+        self.probes = self.probes.saturating_add(1);
         let lengths = [ETHERNET_BYTES, self.datagram_bytes_max];
         for len in lengths.map(|len| len.min(self.datagram_bytes_max)) {
             if len <= self.datagram_bytes {
@@ -850,7 +854,13 @@ const BATCH_BYTES: usize = 60_000;
 const ROOM_MAX: usize = 256 << 10;
 /// `PROTOCOL.md#limits`: the first length that is tried: what an Ethernet frame of 1,500 bytes carries.
 const ETHERNET_BYTES: usize = 1_472;
-/// Time between two tries.
+/// Time between two tries: of the first few one is answered even where a third is lost.
+const PROBE_PAUSES: [Duration; 4] = [
+    Duration::from_millis(100),
+    Duration::from_millis(300),
+    Duration::from_secs(1),
+    Duration::from_secs(3),
+];
 const PROBE_PAUSE: Duration = Duration::from_secs(10);
 /// So much may be sent without a report before their absence means something: receivers report each 2 KiB.
 const SILENT_BYTES: usize = 16 << 10;
