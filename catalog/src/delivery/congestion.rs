@@ -464,6 +464,10 @@ impl Reporter {
         now: Time,
     ) -> Option<(Progress, Way)> {
         let progress = Progress::between(&self.last, report);
+        if 8 * u32::from(self.last.longest) < 7 * u32::from(report.longest) {
+            // Longer ones take longer: only like is compared.
+            self.least = Least::default();
+        }
         self.last = *report;
         self.round_trip = round_trip(report, now);
         let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());

@@ -77,10 +77,14 @@ impl Reception {
         report.bytes = report.bytes.wrapping_add(bytes);
         report.longest = report.longest.max(u16::try_from(len).unwrap_or(u16::MAX));
         let delay = micros(now).wrapping_sub(preamble.sent_us);
+        if 8 * path.long < 7 * len {
+            // Those until now were short ones.
+            path.least = None;
+        }
         if len >= path.long || now.since(path.long_at) >= LONG {
             path.long = len;
         }
-        let is_long = 8 * len >= 7 * path.long;
+        let is_long = len >= LONG_BYTES || 8 * len >= 7 * path.long;
         if is_long {
             path.long_at = now;
         }
@@ -154,6 +158,8 @@ const PAUSE: Duration = Duration::from_millis(50);
 const PAUSE_MANY: Duration = Duration::from_millis(5);
 /// A pause that is reported as over.
 const SILENCE: Duration = Duration::from_millis(400);
+/// What is long in any case: one that only tries a length must not hide those of the length in use.
+const LONG_BYTES: usize = 1_000;
 /// How long the length of long datagrams is remembered.
 const LONG: Duration = Duration::from_secs(10);
 /// Datagrams that are much.
@@ -195,6 +201,17 @@ mod tests {
         assert_eq!((tag, report.highest, report.received), (TAG, 9, 4));
         assert_eq!((report.bytes, report.delay_us), (4_000, 300));
         assert_eq!(report.longest, 1_000);
+    }
+
+    #[test]
+    fn a_longer_one_that_came_once_does_not_hide_the_others() {
+        let mut reception = Reception::new();
+        note(&mut reception, 1, 0, 1_472, 900);
+        assert_eq!(reception.report(Time(900_000)).unwrap().1.delay_us, 900);
+        note(&mut reception, 2, 1_000, 1_200, 1_500);
+        note(&mut reception, 3, 1_000, 1_200, 1_600);
+        let at = reception.deadline().unwrap();
+        assert_eq!(reception.report(at).unwrap().1.delay_us, 500);
     }
 
     #[test]
