@@ -38,13 +38,13 @@ fn each_kind_of_bad_datagram_is_counted_by_its_reason() {
     let daemon = Daemon::start("a", Some('1'), &[]);
     let stranger = UdpSocket::bind("127.0.0.1:0").unwrap();
 
-    for (lane, other_version) in [("control", 2_u8), ("data", 9)] {
+    for (lane, other_version) in [("control", 1_u8), ("data", 9)] {
         let to = if lane == "control" {
             daemon.control()
         } else {
             daemon.data()
         };
-        let mut good_head = vec![1, 0];
+        let mut good_head = vec![2, 0];
         good_head.resize(40, 0);
         let mut other = good_head.clone();
         other[0] = other_version;
