@@ -90,7 +90,8 @@ impl Quality {
 
     /// Whether a group that loses this share of so many datagrams loses more than unicast, and not by chance.
     fn is_worse(&self, share: f64, weight: f64) -> bool {
-        if share > LOSS_HOPELESS && weight >= WEIGHT {
+        let chance = (LOSS_HOPELESS * (1.0 - LOSS_HOPELESS) / weight).sqrt();
+        if share > LOSS_HOPELESS + DEVIATIONS * chance {
             // Perhaps it fills the way of this host, which then loses by unicast too, but would not without it.
             return true;
         }
@@ -190,6 +191,22 @@ mod tests {
         assert!(!quality.handle_report(&report(3, 301, 46), now));
         assert!(!quality.handle_report(&report(3, 401, 145), now));
         assert!(quality.admits(3, now));
+    }
+
+    #[test]
+    fn chance_does_not_end_a_group_that_loses_one_in_three_as_unicast_does() {
+        let mut rng = crate::rng::Rng::new(5);
+        let mut quality = Quality::default();
+        let mut counts = [(1, 1); 2];
+        for step in 0..100_000 {
+            for (path, (highest, received)) in [3, 100].into_iter().zip(&mut counts) {
+                *highest += 5;
+                *received += (0..5).map(|_| u32::from(rng.below(3) > 0)).sum::<u32>();
+                let is_worse =
+                    quality.handle_report(&report(path, *highest, *received), Time(step));
+                assert!(!is_worse, "after {step} reports");
+            }
+        }
     }
 
     #[test]
