@@ -527,20 +527,21 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
                 self.ready.remove(at);
                 continue;
             };
-            let Some(rank) = path.rank() else {
-                // What waits for company stays listed until it is flushed.
-                if path.is_ready() {
-                    at += 1;
-                } else {
-                    self.ready.remove(at);
-                }
+            let rank = path.rank();
+            if rank.is_none() && !path.is_ready() {
+                self.ready.remove(at);
                 continue;
-            };
+            }
             if let Some(until) = path.blocked_until(self.now) {
                 self.blocked.set(to, until);
                 self.ready.remove(at);
                 continue;
             }
+            let Some(rank) = rank else {
+                // What waits for company stays listed until it is flushed.
+                at += 1;
+                continue;
+            };
             if best.is_none_or(|(least, _)| rank < least) {
                 best = Some((rank, at));
             }

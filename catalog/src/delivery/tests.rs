@@ -202,6 +202,20 @@ fn samples_of_one_destination_share_a_datagram() {
 }
 
 #[test]
+fn what_waits_for_company_while_the_rate_holds_it_back_is_woken_for() {
+    let mut sender = sender(Via::Unicast, 1);
+    let held_back = (1..100).find(|seq| {
+        sender.write(STREAM, &meta(1, *seq), &vec![0; 800], Time(0));
+        sender.flush(Time(0));
+        drain(&mut sender).is_empty()
+    });
+    let (at, why) = sender.poll_timeout().unwrap();
+    assert_eq!(why, TimerName::Pace, "{held_back:?}");
+    sender.handle_timeout(at);
+    assert_eq!(drain(&mut sender).len(), 1);
+}
+
+#[test]
 fn repeat_is_confirmed_at_once_even_when_held_already() {
     let mut sender = sender(Via::Unicast, 1);
     let mut receiver = receiver();
