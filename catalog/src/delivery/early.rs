@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use ddx_wire::sample::Record;
+use ddx_wire::sample::{Place, Record};
 use ddx_wire::{StreamId, Tag, Time};
 
 /// Records of streams that are not expected yet, oldest first.
@@ -28,8 +28,8 @@ struct Entry {
 impl Early {
     /// Keeps a record, and drops older ones for which there is no room or no hope. How many were dropped.
     pub(super) fn keep(&mut self, tag: Tag, record: &Record<'_>, now: Time) -> u64 {
-        let mut bytes = Vec::with_capacity(record.encoded_len());
-        if record.encode(&mut bytes).is_err() {
+        let mut bytes = Vec::with_capacity(record.encoded_len(Place::First));
+        if record.encode(Place::First, &mut bytes).is_err() {
             return 1;
         }
         self.held_bytes += bytes.len();

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_wire::sample::{FRAGMENT_RECORD_BYTES, Preamble, RECORD_BYTES, Record, SampleMeta};
+use ddx_wire::sample::{FRAGMENT_RECORD_BYTES, Place, Preamble, RECORD_BYTES, Record, SampleMeta};
 use ddx_wire::seal::{Lane, Sealer};
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
@@ -219,23 +219,22 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             // It went to a new reader out of turn.
             return Offered::Goes;
         }
-        // The value that a new reader wants is on its way with this one.
-        self.forget_turns(stream);
-        let Some(flow) = self.flows.get_mut(&stream) else {
-            return Offered::Goes;
-        };
-        if flow.waits.is_none() {
-            flow.urgent = false;
-        }
-        self.take_turns(stream);
-        let Some(flow) = self.flows.get_mut(&stream) else {
-            return Offered::Goes;
-        };
         if flow.waits.is_some() {
             return Offered::Waits;
         }
+        if flow.urgent {
+            // The value that a new reader wants is on its way with this one.
+            self.forget_turns(stream);
+            if let Some(flow) = self.flows.get_mut(&stream) {
+                flow.urgent = false;
+            }
+            self.take_turns(stream);
+        }
+        let Some(flow) = self.flows.get_mut(&stream) else {
+            return Offered::Goes;
+        };
         let len = payload.as_ref().len();
-        let large = DATAGRAM_OVERHEAD + RECORD_BYTES + len > self.datagram_bytes;
+        let large = self.datagram_bytes < alone_bytes(stream, meta, payload.as_ref());
         let lane = lane_of(flow.is_command(), false);
         let full = if large {
             flow.is_under_way()
@@ -247,6 +246,8 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             // Behind a large one that is on its way it waits for the end of that.
             flow.waits = Some(now);
             self.take_turns(stream);
+            // Who fills a path has a use for longer datagrams.
+            self.probe(now);
             return Offered::Waits;
         }
         self.admit(stream, meta, payload, None, now)
@@ -597,7 +598,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
                     };
                     queue.close();
                     queue.push(&record, datagram_bytes);
-                    cut_bytes += record.encoded_len();
+                    cut_bytes += RECORD_BYTES + payload.len();
                     if queue.len() >= limit.bytes {
                         break;
                     }
@@ -623,10 +624,6 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         now: Time,
     ) -> Offered {
         self.forget_turns(stream);
-        let large = DATAGRAM_OVERHEAD + RECORD_BYTES + payload.as_ref().len() > self.datagram_bytes;
-        if large {
-            self.probe(now);
-        }
         let Some(flow) = self.flows.get_mut(&stream) else {
             return Offered::Goes;
         };
@@ -637,7 +634,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         let meta = SampleMeta { filtered, ..*meta };
         let bytes = payload.as_ref();
         flow.count_bytes(bytes.len());
-        let offered = if large {
+        let offered = if self.datagram_bytes < alone_bytes(stream, &meta, bytes) {
             let step = self.datagram_bytes - DATAGRAM_OVERHEAD - FRAGMENT_RECORD_BYTES;
             let parities = parity::Link {
                 loss_permille: self.congestion.mean_loss_permille(),
@@ -662,7 +659,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
                 payload: bytes,
             };
             let lane = lane_of(flow.is_command(), again.is_some());
-            self.turn = flow.charge(record.encoded_len(), self.turn);
+            self.turn = flow.charge(RECORD_BYTES + bytes.len(), self.turn);
             self.lanes[lane].push(&record, self.datagram_bytes);
             if lane == COMMANDS {
                 self.lanes[lane].close();
@@ -670,6 +667,9 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             Offered::Goes
         };
         self.take_turns(stream);
+        if offered == Offered::Begins {
+            self.probe(now);
+        }
         offered
     }
 
@@ -752,6 +752,19 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             }
         }
     }
+}
+
+/// Length of the datagram that holds a sample alone.
+fn alone_bytes(stream: StreamId, meta: &SampleMeta, payload: &[u8]) -> usize {
+    let record = Record {
+        stream,
+        repeat: false,
+        gone: false,
+        meta: *meta,
+        fragment: None,
+        payload,
+    };
+    DATAGRAM_OVERHEAD + record.encoded_len(Place::Alone)
 }
 
 fn lane_of(command: bool, again: bool) -> usize {

@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use ddx_wire::StreamId;
-use ddx_wire::sample::{PREAMBLE_BYTES, Preamble, Record};
+use ddx_wire::sample::{Last, PADDING, PREAMBLE_BYTES, Place, Preamble, Record};
 use ddx_wire::seal::{HEADER_BYTES, Lane, MIXED_STREAMS, SEAL_BYTES, Sealer};
 
 /// What every data datagram costs beside its records, bytes.
@@ -31,6 +31,7 @@ struct Closed {
 struct Open {
     start: usize,
     stream: StreamId,
+    last: Last,
 }
 
 /// What bounds one batch.
@@ -67,23 +68,40 @@ impl Queue {
 
     /// Adds a record to the open datagram, or to a new one where it does not fit.
     pub(super) fn push(&mut self, record: &Record<'_>, datagram_bytes: usize) {
-        if !self.has_company(record.encoded_len(), datagram_bytes) {
+        let end = self.bytes.len();
+        let fits = |start: usize, bytes: &[u8]| bytes.len() - start + SEAL_BYTES <= datagram_bytes;
+        // None of these can fail: what cannot be encoded is refused before it comes here.
+        if let Some(open) = &mut self.open {
+            record.encode(Place::After(open.last), &mut self.bytes).ok();
+            if fits(open.start, &self.bytes) {
+                if open.stream != record.stream {
+                    open.stream = MIXED_STREAMS;
+                }
+                open.last = record.last();
+                return;
+            }
+            self.bytes.truncate(end);
+            // Only equal datagrams leave in one batch.
+            let full = open.start + datagram_bytes - SEAL_BYTES;
+            if end < full && full - end <= datagram_bytes / PADDED_SHARE {
+                self.bytes.resize(full, PADDING);
+            }
             self.close();
         }
-        match &mut self.open {
-            Some(open) if open.stream == record.stream => {}
-            Some(open) => open.stream = MIXED_STREAMS,
-            None => {
-                let start = self.bytes.len();
-                self.bytes.resize(start + HEADER_BYTES + PREAMBLE_BYTES, 0);
-                self.open = Some(Open {
-                    start,
-                    stream: record.stream,
-                });
-            }
+        let end = self.bytes.len();
+        let head = end + HEADER_BYTES + PREAMBLE_BYTES;
+        self.bytes.resize(head, 0);
+        record.encode(Place::First, &mut self.bytes).ok();
+        self.open = Some(Open {
+            start: end,
+            stream: record.stream,
+            last: record.last(),
+        });
+        if !fits(end, &self.bytes) {
+            self.bytes.truncate(head);
+            record.encode(Place::Alone, &mut self.bytes).ok();
+            self.close();
         }
-        // Cannot fail: what cannot be encoded is refused before it comes here.
-        record.encode(&mut self.bytes).ok();
     }
 
     /// Adds a datagram of exactly `len` bytes that carries nothing.
@@ -169,5 +187,7 @@ impl Queue {
     }
 }
 
+/// A datagram is padded by at most this share of its length.
+const PADDED_SHARE: usize = 16;
 /// How much may have left a queue before what waits moves to the front of its buffer.
 const COMPACT_BYTES: usize = 65_536;

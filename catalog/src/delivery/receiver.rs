@@ -376,7 +376,8 @@ impl Receiver {
         }
         let len = datagram.len();
         let plaintext: &[u8] = session.open(datagram)?.plaintext;
-        let (preamble, records) = Records::open(plaintext).ok_or(Refused::Malformed)?;
+        let stream = single.then_some(header.stream);
+        let (preamble, records) = Records::open(plaintext, stream).ok_or(Refused::Malformed)?;
         self.reception.note(tag, &preamble, len, now);
         for record in records {
             let record = record.map_err(|_| Refused::Malformed)?;

@@ -7,11 +7,15 @@ use crate::{Epoch, Seq, StreamId, Time};
 /// Length of the preamble at the head of each plaintext, bytes.
 pub const PREAMBLE_BYTES: usize = 12;
 
-/// Length of a record before its payload, bytes.
-pub const RECORD_BYTES: usize = 48;
+/// What a record of a whole sample usually takes beside its payload, bytes; one that follows its like takes a quarter.
+pub const RECORD_BYTES: usize = 24;
 
-/// Length of a fragment's record before its payload, bytes.
-pub const FRAGMENT_RECORD_BYTES: usize = 56;
+/// Most that a record of a fragment takes beside its payload, bytes. Senders leave so much room in each, whatever it takes:
+/// the parts of a sample that comes by two ways, on which unlike numbers were left out, must not overlap in part.
+pub const FRAGMENT_RECORD_BYTES: usize = HEAD_MAX;
+
+/// Stands where a record could begin: whatever is left of the datagram only makes it as long as others.
+pub const PADDING: u8 = 128;
 
 /// Greatest sample, bytes: 64 MiB.
 pub const MAX_SAMPLE_BYTES: usize = 64 << 20;
@@ -75,10 +79,37 @@ pub struct Record<'a> {
     pub payload: &'a [u8],
 }
 
+/// Where a record stands in its datagram, which decides what it need not say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// It says all.
+    First,
+    /// Behind this one.
+    After(Last),
+    /// It and no other is in its datagram, whose header names the stream: it says neither that nor its length.
+    Alone,
+}
+
+/// What a record tells of the one behind it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Last {
+    stream: StreamId,
+    meta: SampleMeta,
+}
+
 /// Reads the records of a plaintext, one by one.
 #[derive(Clone, Debug)]
 pub struct Records<'a> {
     rest: &'a [u8],
+    /// The one stream inside, if the header names it.
+    stream: Option<StreamId>,
+    last: Option<Last>,
+}
+
+/// The bytes before a payload.
+struct Head {
+    bytes: [u8; HEAD_MAX],
+    len: usize,
 }
 
 /// A plaintext that is no sequence of records.
@@ -112,51 +143,94 @@ impl Fragment {
 }
 
 impl<'a> Record<'a> {
-    /// Length of the record on the wire, bytes.
-    pub fn encoded_len(&self) -> usize {
-        let head = match self.fragment {
-            None => RECORD_BYTES,
-            Some(_) => FRAGMENT_RECORD_BYTES,
-        };
-        head.saturating_add(self.payload.len())
+    /// Length of the record on the wire at its place, bytes.
+    pub fn encoded_len(&self, place: Place) -> usize {
+        self.head(place).len.saturating_add(self.payload.len())
+    }
+
+    /// What this record tells of the one behind it.
+    pub fn last(&self) -> Last {
+        Last {
+            stream: self.stream,
+            meta: self.meta,
+        }
     }
 
     /// Appends the record. Allocates only if `out` has no capacity for it.
     ///
     /// # Errors
     /// `Malformed` if [`Records`] would refuse it; `out` is then as it was.
-    pub fn encode(&self, out: &mut Vec<u8>) -> Result<(), Malformed> {
-        if !self.is_valid() {
+    pub fn encode(&self, place: Place, out: &mut Vec<u8>) -> Result<(), Malformed> {
+        if !self.is_valid() || self.payload.len() > usize::from(u16::MAX) {
             return Err(Malformed);
         }
-        let len = u16::try_from(self.payload.len()).map_err(|_| Malformed)?;
-        let fragment = if self.fragment.is_some() { FRAGMENT } else { 0 };
-        let repeat = if self.repeat { REPEAT } else { 0 };
-        let gone = if self.gone { GONE } else { 0 };
-        // One growth of the vector for the head keeps the encoder at memcpy speed.
-        let mut head = [0; RECORD_BYTES];
-        let parities = self.fragment.map_or(0, |fragment| fragment.parities);
-        let words = [
-            (u64::from(self.stream.0))
-                | (u64::from(len) << 32)
-                | (u64::from(fragment | repeat | gone) << 48)
-                | (u64::from(parities) << 56),
-            self.meta.epoch.0,
-            self.meta.seq.0,
-            self.meta.filtered,
-            self.meta.capture.0,
-            self.meta.publish.0,
-        ];
-        for (slot, word) in head.chunks_exact_mut(8).zip(words) {
-            slot.copy_from_slice(&word.to_le_bytes());
-        }
-        out.extend_from_slice(&head);
-        if let Some(fragment) = self.fragment {
-            out.extend_from_slice(&fragment.total.to_le_bytes());
-            out.extend_from_slice(&fragment.offset.to_le_bytes());
-        }
+        let head = self.head(place);
+        out.extend_from_slice(head.bytes.get(..head.len).unwrap_or_default());
         out.extend_from_slice(self.payload);
         Ok(())
+    }
+
+    fn head(&self, place: Place) -> Head {
+        let mut head = Head {
+            bytes: [0; HEAD_MAX],
+            len: 0,
+        };
+        let meta = &self.meta;
+        let before = match place {
+            Place::After(last) if self.follows(&last) => Some(last.meta.publish),
+            Place::First | Place::After(_) | Place::Alone => None,
+        };
+        let alone = place == Place::Alone;
+        let flag = |is_set: bool, flag: u8| if is_set { flag } else { 0 };
+        head.push(
+            flag(self.fragment.is_some(), FRAGMENT)
+                | flag(self.repeat, REPEAT)
+                | flag(self.gone, GONE)
+                | flag(before.is_some(), NEXT)
+                | flag(alone, ALONE)
+                | flag(meta.capture != meta.publish, CAPTURE)
+                | flag(meta.filtered != 0, FILTERED),
+        );
+        if !alone {
+            head.varint(u64::try_from(self.payload.len()).unwrap_or(u64::MAX));
+        }
+        if let Some(before) = before {
+            head.varint(meta.publish.0.wrapping_sub(before.0));
+        } else {
+            if !alone {
+                head.varint(self.stream.0.into());
+            }
+            head.varint(meta.epoch.0);
+            head.varint(meta.seq.0);
+            head.varint(meta.publish.0);
+        }
+        if meta.capture != meta.publish {
+            head.varint(zigzag(meta.publish.0.wrapping_sub(meta.capture.0)));
+        }
+        if meta.filtered != 0 && before.is_none() {
+            head.varint(meta.filtered);
+        }
+        if let Some(fragment) = self.fragment {
+            for byte in fragment.total.to_le_bytes() {
+                head.push(byte);
+            }
+            for byte in fragment.offset.to_le_bytes() {
+                head.push(byte);
+            }
+            head.push(fragment.parities);
+        }
+        head
+    }
+
+    /// Whether the sample is the next one of the same stream, and nothing was left out between.
+    fn follows(&self, last: &Last) -> bool {
+        let (meta, before) = (&self.meta, &last.meta);
+        self.stream == last.stream
+            && self.fragment.is_none()
+            && meta.epoch == before.epoch
+            && Some(meta.seq.0) == before.seq.0.checked_add(1)
+            && meta.filtered == before.filtered
+            && meta.publish >= before.publish
     }
 
     fn is_valid(&self) -> bool {
@@ -183,8 +257,9 @@ impl<'a> Record<'a> {
 }
 
 impl<'a> Records<'a> {
-    /// Reads the head of an opened datagram, and starts at its first record. `None` if the head is not one.
-    pub fn open(plaintext: &'a [u8]) -> Option<(Preamble, Self)> {
+    /// Reads the head of an opened datagram, and starts at its first record. `stream` is the one that its header names, if
+    /// it names one. `None` if the head is not one.
+    pub fn open(plaintext: &'a [u8], stream: Option<StreamId>) -> Option<(Preamble, Self)> {
         let (&[p0, p1, f0, f1], rest) = plaintext.split_first_chunk()?;
         let (number, rest) = rest.split_first_chunk()?;
         let (sent_us, rest) = rest.split_first_chunk()?;
@@ -199,29 +274,84 @@ impl<'a> Records<'a> {
             is_probe: flags & PROBE != 0,
         };
         let rest = if preamble.is_probe { &[] } else { rest };
-        Some((preamble, Self { rest }))
+        let records = Self {
+            stream,
+            ..Self::new(rest)
+        };
+        Some((preamble, records))
     }
 
     /// Starts at a record.
     pub fn new(records: &'a [u8]) -> Self {
-        Self { rest: records }
+        Self {
+            rest: records,
+            stream: None,
+            last: None,
+        }
     }
 
-    fn read(bytes: &'a [u8]) -> Option<(Record<'a>, &'a [u8])> {
-        let (&[s0, s1, s2, s3, l0, l1, flags, parities], rest) = bytes.split_first_chunk()?;
-        if flags & !(FRAGMENT | REPEAT | GONE) != 0 || (parities != 0 && flags & FRAGMENT == 0) {
+    fn read(&self) -> Option<(Record<'a>, &'a [u8])> {
+        let (&flags, rest) = self.rest.split_first()?;
+        let is = |flag: u8| flags & flag != 0;
+        if flags & !FLAGS != 0 || (is(NEXT) && flags & (FRAGMENT | ALONE) != 0) {
             return None;
         }
-        let (epoch, rest) = split_u64(rest)?;
-        let (seq, rest) = split_u64(rest)?;
-        let (filtered, rest) = split_u64(rest)?;
-        let (capture, rest) = split_u64(rest)?;
-        let (publish, rest) = split_u64(rest)?;
-        let (fragment, rest) = if flags & FRAGMENT == 0 {
-            (None, rest)
+        let (len, rest) = match is(ALONE) {
+            true => (None, rest),
+            false => {
+                let (len, rest) = varint(rest)?;
+                (Some(u16::try_from(len).ok()?), rest)
+            }
+        };
+        let (stream, mut meta, rest) = if is(NEXT) {
+            let last = self.last?;
+            let (ahead, rest) = varint(rest)?;
+            let meta = SampleMeta {
+                seq: Seq(last.meta.seq.0.checked_add(1)?),
+                publish: Time(last.meta.publish.0.checked_add(ahead)?),
+                ..last.meta
+            };
+            if is(FILTERED) != (meta.filtered != 0) {
+                return None;
+            }
+            (last.stream, meta, rest)
         } else {
+            let (stream, rest) = match is(ALONE) {
+                true if self.last.is_some() => return None,
+                true => (self.stream?, rest),
+                false => {
+                    let (stream, rest) = varint(rest)?;
+                    (StreamId(u32::try_from(stream).ok()?), rest)
+                }
+            };
+            let (epoch, rest) = varint(rest)?;
+            let (seq, rest) = varint(rest)?;
+            let (publish, rest) = varint(rest)?;
+            let meta = SampleMeta {
+                epoch: Epoch(epoch),
+                seq: Seq(seq),
+                filtered: 0,
+                capture: Time(0),
+                publish: Time(publish),
+            };
+            (stream, meta, rest)
+        };
+        let (earlier, rest) = match is(CAPTURE) {
+            true => varint(rest)?,
+            false => (0, rest),
+        };
+        meta.capture = Time(meta.publish.0.wrapping_sub(unzigzag(earlier)));
+        let rest = if is(FILTERED) && !is(NEXT) {
+            let (filtered, rest) = varint(rest)?;
+            meta.filtered = filtered;
+            rest
+        } else {
+            rest
+        };
+        let (fragment, rest) = if is(FRAGMENT) {
             let (total, rest) = rest.split_first_chunk()?;
             let (offset, rest) = rest.split_first_chunk()?;
+            let (&parities, rest) = rest.split_first()?;
             let total = u32::from_le_bytes(*total);
             let offset = u32::from_le_bytes(*offset);
             let fragment = Fragment {
@@ -230,20 +360,16 @@ impl<'a> Records<'a> {
                 parities,
             };
             (Some(fragment), rest)
+        } else {
+            (None, rest)
         };
-        let len = usize::from(u16::from_le_bytes([l0, l1]));
+        let len = len.map_or(rest.len(), usize::from);
         let (payload, rest) = rest.split_at_checked(len)?;
         let record = Record {
-            stream: StreamId(u32::from_le_bytes([s0, s1, s2, s3])),
-            repeat: flags & REPEAT != 0,
-            gone: flags & GONE != 0,
-            meta: SampleMeta {
-                epoch: Epoch(epoch),
-                seq: Seq(seq),
-                filtered,
-                capture: Time(capture),
-                publish: Time(publish),
-            },
+            stream,
+            repeat: is(REPEAT),
+            gone: is(GONE),
+            meta,
             fragment,
             payload,
         };
@@ -256,21 +382,64 @@ impl<'a> Iterator for Records<'a> {
 
     /// The next record; after an error nothing more, since the place of the next record is then unknown.
     fn next(&mut self) -> Option<Self::Item> {
-        if self.rest.is_empty() {
+        if self.rest.first().is_none_or(|first| *first == PADDING) {
             return None;
         }
-        let Some((record, rest)) = Self::read(self.rest) else {
+        let Some((record, rest)) = self.read() else {
             self.rest = &[];
             return Some(Err(Malformed));
         };
         self.rest = rest;
+        self.last = Some(record.last());
         Some(Ok(record))
     }
 }
 
-fn split_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
-    let (word, rest) = bytes.split_first_chunk()?;
-    Some((u64::from_le_bytes(*word), rest))
+impl Head {
+    fn push(&mut self, byte: u8) {
+        if let Some(place) = self.bytes.get_mut(self.len) {
+            *place = byte;
+            self.len = self.len.saturating_add(1);
+        }
+    }
+
+    /// Seven bits a byte, the lowest first; the highest bit says that more follow.
+    fn varint(&mut self, value: u64) {
+        let mut rest = value;
+        while rest > u64::from(MORE - 1) {
+            let [low, ..] = rest.to_le_bytes();
+            self.push(low | MORE);
+            rest >>= 7;
+        }
+        let [low, ..] = rest.to_le_bytes();
+        self.push(low);
+    }
+}
+
+fn varint(bytes: &[u8]) -> Option<(u64, &[u8])> {
+    let mut value = 0_u64;
+    let mut rest = bytes;
+    for shift in (0_u32..64).step_by(7) {
+        let (&byte, after) = rest.split_first()?;
+        rest = after;
+        let bits = u64::from(byte & !MORE);
+        // Nothing is shifted out at the top.
+        value |= bits.checked_shl(shift).filter(|v| v >> shift == bits)?;
+        if byte & MORE == 0 {
+            return Some((value, rest));
+        }
+    }
+    None
+}
+
+/// A difference that may be negative, as a number that is small if that is near 0.
+fn zigzag(difference: u64) -> u64 {
+    let signed = difference.cast_signed();
+    ((signed << 1) ^ (signed >> 63)).cast_unsigned()
+}
+
+fn unzigzag(value: u64) -> u64 {
+    (value >> 1) ^ (value & 1).wrapping_neg()
 }
 
 /// Flag: the record holds a part of a sample.
@@ -279,6 +448,20 @@ const FRAGMENT: u8 = 1;
 const REPEAT: u8 = 2;
 /// Flag: the sample cannot be had any more.
 const GONE: u8 = 4;
+/// Flag: the next sample of the record before.
+const NEXT: u8 = 8;
+/// Flag: neither stream nor length is given.
+const ALONE: u8 = 16;
+/// Flag: captured at another time than published.
+const CAPTURE: u8 = 32;
+/// Flag: some samples were left out.
+const FILTERED: u8 = 64;
+/// All flags that there are.
+const FLAGS: u8 = 127;
+/// In a byte of a number: more follow.
+const MORE: u8 = 128;
+/// Flags, the length, the number of the stream, five numbers of 64 bits, and what a fragment says of itself.
+const HEAD_MAX: usize = 1 + 3 + 5 + 5 * 10 + 9;
 /// Flag of the preamble: padding follows.
 const PROBE: u16 = 1;
 
@@ -318,26 +501,94 @@ mod tests {
 
     fn encoded(record: Record<'_>) -> Vec<u8> {
         let mut bytes = Vec::new();
-        record.encode(&mut bytes).unwrap();
-        assert_eq!(bytes.len(), record.encoded_len());
+        record.encode(Place::First, &mut bytes).unwrap();
+        assert_eq!(bytes.len(), record.encoded_len(Place::First));
         bytes
+    }
+
+    /// The same stream's next sample.
+    fn next<'a>(record: &Record<'_>, payload: &'a [u8]) -> Record<'a> {
+        Record {
+            stream: record.stream,
+            repeat: false,
+            gone: false,
+            meta: SampleMeta {
+                seq: Seq(record.meta.seq.0 + 1),
+                capture: Time(record.meta.publish.0 + 300),
+                publish: Time(record.meta.publish.0 + 300),
+                ..record.meta
+            },
+            fragment: None,
+            payload,
+        }
     }
 
     #[test]
     fn whole_sample_is_golden() {
-        let mut golden = vec![1, 2, 3, 4, 2, 0, 2, 0];
-        for byte in [0x10, 0x20, 0x30, 0x40, 0x50] {
-            golden.extend([byte, 0, 0, 0, 0, 0, 0, 0]);
-        }
-        golden.extend(*b"ab");
+        let golden = [
+            2 + 32 + 64,
+            2,
+            0x81,
+            0x84,
+            0x8c,
+            0x20,
+            0x10,
+            0x20,
+            0x50,
+            0x20,
+            0x30,
+            b'a',
+            b'b',
+        ];
         assert_eq!(encoded(record(b"ab")), golden);
+    }
+
+    #[test]
+    fn what_follows_is_golden() {
+        let first = record(b"ab");
+        let second = next(&first, b"c");
+        let mut bytes = encoded(first);
+        let start = bytes.len();
+        second
+            .encode(Place::After(first.last()), &mut bytes)
+            .unwrap();
+        assert_eq!(bytes[start..], [8 + 64, 1, 0xac, 0x02, b'c']);
+        let read: Vec<_> = Records::new(&bytes).collect();
+        assert_eq!(read, [Ok(first), Ok(second)]);
+        // Alone it follows nothing.
+        assert_eq!(Records::new(&bytes[start..]).next(), Some(Err(Malformed)));
+    }
+
+    #[test]
+    fn one_that_is_alone_is_golden_and_needs_the_stream_of_its_header() {
+        let mut bytes = vec![0; PREAMBLE_BYTES];
+        let alone = Record {
+            repeat: false,
+            meta: SampleMeta {
+                filtered: 0,
+                capture: Time(0x50),
+                ..record(b"").meta
+            },
+            ..record(b"ab")
+        };
+        alone.encode(Place::Alone, &mut bytes).unwrap();
+        assert_eq!(bytes[PREAMBLE_BYTES..], [16, 0x10, 0x20, 0x50, b'a', b'b']);
+        let (_, records) = Records::open(&bytes, Some(alone.stream)).unwrap();
+        assert_eq!(records.collect::<Vec<_>>(), [Ok(alone)]);
+        let (_, mut records) = Records::open(&bytes, None).unwrap();
+        assert_eq!(records.next(), Some(Err(Malformed)));
+        let mut behind = encoded(record(b"ab"));
+        alone.encode(Place::Alone, &mut behind).unwrap();
+        let mut records = Records::new(&behind);
+        records.stream = Some(alone.stream);
+        assert_eq!(records.nth(1), Some(Err(Malformed)));
     }
 
     #[test]
     fn fragment_is_golden() {
         let bytes = encoded(fragment(0x102, 0x100, b"ab"));
-        assert_eq!(bytes[4..8], [2, 0, 3, 0]);
-        assert_eq!(bytes[48..], [2, 1, 0, 0, 0, 1, 0, 0, b'a', b'b']);
+        assert_eq!(bytes[..2], [1 + 2 + 32 + 64, 2]);
+        assert_eq!(bytes[11..], [2, 1, 0, 0, 0, 1, 0, 0, 0, b'a', b'b']);
     }
 
     #[test]
@@ -353,8 +604,8 @@ mod tests {
         // The sample takes 130 fragments of 2 bytes, the last of them short.
         let good = parity(0x106, 2, b"pq");
         let bytes = encoded(good);
-        assert_eq!(bytes[4..8], [2, 0, 3, 2]);
-        assert_eq!(bytes[48..], [3, 1, 0, 0, 6, 1, 0, 0, b'p', b'q']);
+        assert_eq!(bytes[..2], [1 + 2 + 32 + 64, 2]);
+        assert_eq!(bytes[11..], [3, 1, 0, 0, 6, 1, 0, 0, 2, b'p', b'q']);
         assert_eq!(Records::new(&bytes).next(), Some(Ok(good)));
         assert_eq!(good.fragment.unwrap().parity(2), Some(1));
         assert_eq!(parity(0x104, 1, b"pq").fragment.unwrap().parity(2), Some(0));
@@ -364,7 +615,8 @@ mod tests {
             parity(0x105, 2, b"p"),
             parity(0x103, 0, b"pq"),
         ] {
-            assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed), "{bad:?}");
+            let refused = bad.encode(Place::First, &mut Vec::new());
+            assert_eq!(refused, Err(Malformed), "{bad:?}");
         }
     }
 
@@ -393,10 +645,11 @@ mod tests {
             fragment(limit + 1, 0, b"a"),
             fragment(u32::MAX, u32::MAX, b"a"),
         ] {
-            assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed), "{bad:?}");
+            let refused = bad.encode(Place::First, &mut Vec::new());
+            assert_eq!(refused, Err(Malformed), "{bad:?}");
         }
         let good = encoded(record(b"ab"));
-        for (at, value) in [(4, 3), (6, 4), (6, 8), (7, 1), (16, 0)] {
+        for (at, value) in [(0, 129), (0, 8), (0, 16), (0, 2 + 4), (1, 3), (7, 0)] {
             let mut bad = good.clone();
             bad[at] = value;
             assert_eq!(Records::new(&bad).next(), Some(Err(Malformed)), "{at}");
@@ -406,6 +659,13 @@ mod tests {
             assert_eq!(records.next(), Some(Err(Malformed)));
             assert_eq!(records.next(), None);
         }
+        let mut padded = good;
+        padded.extend([PADDING, 1, 2]);
+        assert_eq!(Records::new(&padded).count(), 1);
+        // A number of more than 64 bits.
+        let mut long = vec![0xff; 12];
+        long[0] = 0;
+        assert_eq!(Records::new(&long).next(), Some(Err(Malformed)));
     }
 
     #[test]
@@ -420,12 +680,12 @@ mod tests {
             let mut bytes = preamble.to_bytes().to_vec();
             assert_eq!(bytes[..4], [2, 1, u8::from(is_probe), 0]);
             bytes.extend([9; 3]);
-            let (read, records) = Records::open(&bytes).unwrap();
+            let (read, records) = Records::open(&bytes, None).unwrap();
             assert_eq!(read, preamble);
             assert_eq!(records.count(), usize::from(!is_probe));
         }
-        assert!(Records::open(&[0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0]).is_none());
-        assert!(Records::open(&[0; 11]).is_none());
+        assert!(Records::open(&[0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0], None).is_none());
+        assert!(Records::open(&[0; 11], None).is_none());
     }
 
     #[test]
@@ -442,17 +702,49 @@ mod tests {
             gone: true,
             ..record(b"short")
         };
-        assert_eq!(bad.encode(&mut Vec::new()), Err(Malformed));
+        assert_eq!(bad.encode(Place::First, &mut Vec::new()), Err(Malformed));
     }
 
     proptest! {
         #[test]
         fn arbitrary_bytes_end_and_reencode(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            let read: Vec<_> = Records::new(&bytes).map_while(Result::ok).collect();
             let mut again = Vec::new();
-            for record in Records::new(&bytes).map_while(Result::ok) {
-                record.encode(&mut again).unwrap();
+            let mut place = Place::First;
+            for record in &read {
+                record.encode(place, &mut again).unwrap();
+                place = Place::After(record.last());
             }
-            prop_assert!(bytes.starts_with(&again));
+            let reread: Vec<_> = Records::new(&again).map_while(Result::ok).collect();
+            prop_assert_eq!(read, reread);
+        }
+
+        #[test]
+        fn whatever_is_written_is_read(
+            metas in prop::collection::vec((any::<u64>(), 1_u64.., any::<[u64; 3]>(), any::<bool>()), 1..20),
+        ) {
+            let mut bytes = Vec::new();
+            let mut place = Place::First;
+            let mut written: Vec<Record<'_>> = Vec::new();
+            for (epoch, seq, [filtered, capture, publish], follows) in metas {
+                let meta = SampleMeta {
+                    epoch: Epoch(epoch),
+                    seq: Seq(seq),
+                    filtered,
+                    capture: Time(capture),
+                    publish: Time(publish),
+                };
+                let new = Record { meta, ..record(b"x") };
+                let record = match written.last() {
+                    Some(last) if follows && last.meta.seq.0 < u64::MAX && last.meta.publish.0 < u64::MAX - 300 => next(last, b"y"),
+                    Some(_) | None => new,
+                };
+                record.encode(place, &mut bytes).unwrap();
+                place = Place::After(record.last());
+                written.push(record);
+            }
+            let read: Vec<_> = Records::new(&bytes).map_while(Result::ok).collect();
+            prop_assert_eq!(read, written);
         }
     }
 }

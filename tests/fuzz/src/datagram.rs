@@ -16,7 +16,7 @@ use ddx_wire::message::{
     AckEntry, Change, Delta, DigestEntry, GrantEntry, Greeting, Introduction, ItemState, Message,
     Range, Reception, RenewEntry, SchemaPart, SubscribeEntry,
 };
-use ddx_wire::sample::{Fragment, Preamble, Record};
+use ddx_wire::sample::{Fragment, Place, Preamble, Record};
 use ddx_wire::seal::{
     self, DomainKey, HEADER_BYTES, Lane, MAX_DATAGRAM_BYTES, MIXED_STREAMS, Purpose, Sealer,
 };
@@ -790,7 +790,7 @@ fn records(input: &mut Input<'_>) -> Vec<u8> {
             fragment,
             payload,
         }
-        .encode(&mut plaintext);
+        .encode(Place::First, &mut plaintext);
     }
     plaintext
 }
