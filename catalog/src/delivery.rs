@@ -37,6 +37,7 @@ mod reassembly;
 mod receiver;
 mod reception;
 mod sender;
+mod shares;
 mod stream;
 mod transfer;
 

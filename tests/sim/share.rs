@@ -410,3 +410,46 @@ fn a_group_that_loses_is_left_and_found_again() {
     assert!(play.sim.now() < start + secs(45));
     check(&play.sim).unwrap();
 }
+
+/// Robots that send to one ground station cannot see each other.
+#[test]
+fn senders_that_fill_one_link_share_it() {
+    for seed in 0..10 {
+        let mut sim = quiet(seed, 5);
+        let slow = format!("lan --rate \"2 Mbit/s\" --delay \"20 ms\" --seed {seed}");
+        sim.set_profile(0, 0, &profile(&slow));
+        let lens = [1_100, 5_000, 40_000, 48];
+        let names: Vec<_> = (1..5).map(|host| sim.announce(host, "x")).collect();
+        let mut received = [0; 4];
+        let mut held = [None; 4];
+        for (at, name) in names.iter().enumerate() {
+            sim.subscribe(0, name, Contract::default());
+            let end = if at < 3 { secs(3) } else { secs(10) };
+            let start = sim.now();
+            while sim.now() < start + end {
+                for (host, name) in names.iter().enumerate() {
+                    // The last one wants little, 10 kB/s.
+                    sim.write(host + 1, name, lens[host]);
+                    let newest = sim.host(0).held(name);
+                    if at == 3 && newest != held[host] && sim.now() > start + secs(4) {
+                        received[host] += lens[host] / 6;
+                    }
+                    held[host] = newest;
+                }
+                sim.run_for(millis(5));
+            }
+        }
+        println!("seed {seed}: {received:?} B/s");
+        let (least, most) = (
+            received[..3].iter().min().unwrap(),
+            received[..3].iter().max().unwrap(),
+        );
+        assert!(3 * least > 2 * *most, "seed {seed}: {received:?}");
+        assert!(
+            received.iter().sum::<usize>() > 170_000,
+            "seed {seed}: {received:?}"
+        );
+        assert!(received[3] > 4_000, "seed {seed}: {received:?}");
+        check(&sim).unwrap();
+    }
+}

@@ -50,6 +50,8 @@ pub(super) struct Congestion {
     grown_at: Time,
     /// The rate before nothing was heard any more.
     before_silence: Option<f64>,
+    /// What arrives of this sender, as a multiple of the mean of all that share the path.
+    share: f64,
 }
 
 /// What one report adds to the one before.
@@ -74,6 +76,8 @@ pub(super) struct Way {
     pub(super) queue: Duration,
     /// What it is shorter.
     shorter: Duration,
+    /// What arrives by it, in thousandths of the mean of all senders that share it, as far as its end can tell.
+    share: u16,
 }
 
 /// One host that reports about a path, and what it said.
@@ -127,6 +131,7 @@ impl Congestion {
             slowed_queue: Duration::ZERO,
             grown_at: now,
             before_silence: None,
+            share: 1.0,
         }
     }
 
@@ -171,7 +176,12 @@ impl Congestion {
             // The link is back, perhaps as it was.
             self.bytes_per_second = (rate / 2.0).max(self.bytes_per_second);
         }
-        let Way { queue, shorter } = way;
+        let Way {
+            queue,
+            shorter,
+            share,
+        } = way;
+        self.share = (f64::from(share) / 1_000.0).clamp(SHARE_MIN, SHARE_MAX);
         let queue_before = std::mem::replace(&mut self.queue, queue);
         if queue_before <= self.queue_low() && !self.is_trying(used) {
             self.note_jitter(queue.saturating_sub(queue_before));
@@ -219,7 +229,7 @@ impl Congestion {
             // A full path with a short queue, or one that has begun to lose: if slowing down does not help, it is the
             // latter.
             self.loss += (lost - self.loss) / 2.0;
-            self.bytes_per_second *= 0.85;
+            self.bytes_per_second *= self.yielding(0.85);
             self.slowed(sent, seen_after, now);
         } else {
             let weight = (datagrams / f64::from(ARRIVED_DATAGRAMS)).min(1.0);
@@ -298,8 +308,18 @@ impl Congestion {
             }
             _ => capacity,
         };
-        self.ceiling = Some(carries);
-        self.bytes_per_second = (capacity.min(carries) * share).min(self.bytes_per_second * least);
+        self.ceiling = Some(self.yielding(1.0) * carries);
+        let lowered = (capacity.min(carries) * share).min(self.bytes_per_second * least);
+        self.bytes_per_second *= self.yielding(lowered / self.bytes_per_second);
+    }
+
+    /// What is left of the rate when it falls: of several senders on one path those with more than others give it up.
+    fn yielding(&self, left: f64) -> f64 {
+        if self.share < 1.0 {
+            1.0 - (1.0 - left) * self.share
+        } else {
+            left / self.share.cbrt()
+        }
     }
 
     /// Share of what the path carries at which what has piled up is gone soon.
@@ -322,8 +342,9 @@ impl Congestion {
             ..2.0 => (ceiling + capacity) / 2.0,
             _ => capacity,
         };
-        self.ceiling = Some(ceiling);
-        self.bytes_per_second = self.share_to_drain(seen_after) * ceiling;
+        self.ceiling = Some(self.yielding(1.0) * ceiling);
+        let lowered = self.share_to_drain(seen_after) * ceiling;
+        self.bytes_per_second *= self.yielding((lowered / self.bytes_per_second).min(1.0));
         self.try_pause = if self.beyond > 0 {
             TRY_PAUSE_MIN
         } else {
@@ -345,13 +366,13 @@ impl Congestion {
                 // What piles up before it is seen stays small.
                 let time = seen_after.as_secs_f64().max(0.001);
                 let low = self.queue_low().as_secs_f64() / time;
-                let mut share = (low / 3.0).clamp(0.0025, 0.05);
+                let mut share = (low / 3.0).clamp(0.0025, 0.05) / self.share;
                 if rate > ceiling * (1.0 + low / 2.0).clamp(1.03, BEYOND) {
                     self.beyond += 1;
                     share = (share * f64::from(1_u32 << self.beyond.min(7))).min(0.5);
                 }
                 // So that of several paths that share a link the slow ones catch up.
-                (rate * (1.0 + share)).max(rate + STEP_BYTES / time)
+                (rate * (1.0 + share)).max(rate + STEP_BYTES / self.share / time)
             }
         };
         (self.grown_at, self.limited) = (now, false);
@@ -479,7 +500,15 @@ impl Reporter {
         let progress = progress?;
         let loss = progress.loss();
         self.strain = Some((Strain { queue, loss }, now));
-        Some((progress, Way { queue, shorter }))
+        let share = report.share;
+        Some((
+            progress,
+            Way {
+                queue,
+                shorter,
+                share,
+            },
+        ))
     }
 
     /// How hard the path is for it, if it said so of late.
@@ -570,6 +599,9 @@ const LOSS_STEP: f64 = 0.15;
 const STEP_BYTES: f64 = 60.0;
 /// Multiple of what the path carried when it was full, above which it is another path.
 const BEYOND: f64 = 1.15;
+/// Bounds of the share that a sender believes.
+const SHARE_MIN: f64 = 0.25;
+const SHARE_MAX: f64 = 3.0;
 /// Datagrams that tell a rate, whatever the jitter of each.
 const ARRIVED_DATAGRAMS: u32 = 8;
 /// Least time that tells a rate.
@@ -635,6 +667,7 @@ mod tests {
             };
             let way = Way {
                 queue,
+                share: 1_000,
                 ..Way::default()
             };
             congestion.handle_report(&progress, way, used, round_trip, 0, now);
@@ -736,6 +769,7 @@ mod tests {
             delay_us: 7,
             at_us: u32::MAX - 999,
             longest: 1200,
+            share: 1_000,
         };
         let next = ReportEntry {
             highest: 9,
@@ -764,6 +798,7 @@ mod tests {
             delay_us,
             at_us: number * 1_000,
             longest: 1_000,
+            share: 1_000,
         };
         let mut reporter = Reporter::new(report(1, 1_000), Time(0));
         let mut queue = |number, delay_us, s: u64| {

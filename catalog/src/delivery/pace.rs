@@ -11,6 +11,8 @@ pub(super) struct Pace {
     free_at: Time,
     used: Used,
     asked: Time,
+    /// When the rate last held something back.
+    limited_at: Option<Time>,
 }
 
 /// How a path was used for a while.
@@ -28,14 +30,24 @@ impl Pace {
             free_at: now,
             used: Used::default(),
             asked: now,
+            limited_at: None,
         }
     }
 
     /// Tells when the next batch may go, if that is later than `now`. Call it only with something to send.
     pub(super) fn blocked_until(&mut self, now: Time) -> Option<Time> {
         let blocked = self.free_at > now;
-        self.used.limited |= blocked;
+        if blocked {
+            self.used.limited = true;
+            self.limited_at = Some(now);
+        }
         blocked.then_some(self.free_at)
+    }
+
+    /// Whether the rate held something back of late.
+    pub(super) fn is_limited(&self, now: Time) -> bool {
+        self.limited_at
+            .is_some_and(|at| now.since(at) < LIMITED_LASTS)
     }
 
     /// Notes that a batch goes now, at `rate` bytes per second.
@@ -68,6 +80,8 @@ pub(super) fn batch_bytes(rate: u64) -> usize {
 
 /// `PROTOCOL.md#limits`: a batch is at most what the paced rate sends in 200 us.
 const BURST: Duration = Duration::from_micros(200);
+/// How long it counts that something was held back.
+const LIMITED_LASTS: Duration = Duration::from_millis(200);
 const NANOS: u128 = 1_000_000_000;
 
 #[cfg(test)]

@@ -523,6 +523,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             number: self.datagrams,
             sent_us: u32::try_from(micros & u64::from(u32::MAX)).unwrap_or_default(),
             is_probe: false,
+            is_limited: self.pace.is_limited(now),
         };
         let first = self.lanes[rank].pop(LANES[rank], sealer, limit, &mut preamble, out);
         self.datagrams = preamble.number;

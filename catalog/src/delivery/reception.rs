@@ -8,12 +8,14 @@ use ddx_wire::sample::Preamble;
 use ddx_wire::{Tag, Time};
 
 use super::deadlines::Deadlines;
+use super::shares::Shares;
 
 /// Counts and times of all paths that end here.
 #[derive(Debug)]
 pub(super) struct Reception {
     paths: BTreeMap<(Tag, u16), Path>,
     due: Deadlines<(Tag, u16)>,
+    shares: Shares,
 }
 
 #[derive(Debug)]
@@ -37,11 +39,13 @@ impl Reception {
         Self {
             paths: BTreeMap::new(),
             due: Deadlines::new(),
+            shares: Shares::default(),
         }
     }
 
     /// Notes a datagram. Those of a sender's paths beyond the limit are not reported.
     pub(super) fn note(&mut self, tag: Tag, preamble: &Preamble, len: usize, now: Time) {
+        self.shares.note(tag, len, preamble.is_limited, now);
         let at = (tag, preamble.path);
         if !self.paths.contains_key(&at) && self.of(tag).count() >= PATHS {
             return;
@@ -55,6 +59,7 @@ impl Reception {
                 delay_us: 0,
                 at_us: 0,
                 longest: 0,
+                share: 0,
             },
             least: None,
             least_short: None,
@@ -125,6 +130,7 @@ impl Reception {
         let grown = short.filter(|delay| delay.wrapping_sub(before).cast_signed() > 0);
         path.report.delay_us = path.least.take().or(grown).unwrap_or(before);
         path.report.at_us = micros(now);
+        path.report.share = self.shares.of(at.0, now);
         Some((at.0, path.report))
     }
 
@@ -135,6 +141,7 @@ impl Reception {
             self.paths.remove(&path);
             self.due.clear(path);
         }
+        self.shares.forget(tag);
     }
 
     fn of(&self, tag: Tag) -> impl Iterator<Item = (Tag, u16)> {
@@ -177,6 +184,7 @@ mod tests {
             number,
             sent_us,
             is_probe: false,
+            is_limited: false,
         };
         reception.note(TAG, &preamble, len, Time(at_us * 1_000));
     }

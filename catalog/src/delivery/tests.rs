@@ -469,6 +469,7 @@ fn two_readers_of_unlike_paths_do_not_disturb_one_another() {
         delay_us: 0,
         at_us: 0,
         longest: 1_200,
+        share: 1_000,
     };
     for seq in 1..=2_000 {
         now = now + 5 * MS;
@@ -517,6 +518,7 @@ fn a_member_behind_a_slower_link_does_not_slow_its_group_down() {
                 delay_us: 500,
                 at_us: round * 50_000,
                 longest: 1_200,
+                share: 1_000,
             };
             let badly = ReportEntry {
                 received: numbers / 2,

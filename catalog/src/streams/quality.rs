@@ -154,6 +154,7 @@ mod tests {
             delay_us: 0,
             at_us: highest * 1_000,
             longest: 100,
+            share: 1_000,
         }
     }
 

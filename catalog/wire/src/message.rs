@@ -320,6 +320,9 @@ pub struct ReportEntry {
     pub at_us: u32,
     /// Longest datagram that ever arrived, bytes.
     pub longest: u16,
+    /// How much of what arrives at this host is the sender's, in thousandths of the mean of all senders that have more to
+    /// send than their rates let through: 1,000 for one that is alone.
+    pub share: u16,
 }
 
 /// What a reading host lacks of one stream.
@@ -417,6 +420,7 @@ mod tests {
             delay_us: u32::MAX,
             at_us: u32::MAX,
             longest: u16::MAX,
+            share: u16::MAX,
         };
         assert!(length(&Message::Report(vec![report; REPORTS_MAX])) <= BODY_MAX_BYTES);
         let nack = NackEntry {

@@ -46,6 +46,8 @@ pub struct Preamble {
     pub sent_us: u32,
     /// What follows is padding: the datagram only tries whether its length gets through.
     pub is_probe: bool,
+    /// The sender has more for the destination than its rate lets through.
+    pub is_limited: bool,
 }
 
 /// Place of a fragment in its sample.
@@ -120,7 +122,9 @@ pub struct Malformed;
 impl Preamble {
     /// The bytes on the wire.
     pub fn to_bytes(self) -> [u8; PREAMBLE_BYTES] {
-        let flags = if self.is_probe { PROBE } else { 0 };
+        let probe = if self.is_probe { PROBE } else { 0 };
+        let limited = if self.is_limited { LIMITED } else { 0 };
+        let flags = probe | limited;
         let [p0, p1] = self.path.to_le_bytes();
         let [f0, f1] = flags.to_le_bytes();
         let [n0, n1, n2, n3] = self.number.to_le_bytes();
@@ -264,7 +268,7 @@ impl<'a> Records<'a> {
         let (number, rest) = rest.split_first_chunk()?;
         let (sent_us, rest) = rest.split_first_chunk()?;
         let flags = u16::from_le_bytes([f0, f1]);
-        if flags & !PROBE != 0 {
+        if flags & !(PROBE | LIMITED) != 0 {
             return None;
         }
         let preamble = Preamble {
@@ -272,6 +276,7 @@ impl<'a> Records<'a> {
             number: u32::from_le_bytes(*number),
             sent_us: u32::from_le_bytes(*sent_us),
             is_probe: flags & PROBE != 0,
+            is_limited: flags & LIMITED != 0,
         };
         let rest = if preamble.is_probe { &[] } else { rest };
         let records = Self {
@@ -464,6 +469,8 @@ const MORE: u8 = 128;
 const HEAD_MAX: usize = 1 + 3 + 5 + 5 * 10 + 9;
 /// Flag of the preamble: padding follows.
 const PROBE: u16 = 1;
+/// Flag of the preamble: the rate holds the sender back.
+const LIMITED: u16 = 2;
 
 #[cfg(test)]
 mod tests {
@@ -670,21 +677,23 @@ mod tests {
 
     #[test]
     fn a_preamble_reads_back_and_a_probe_has_no_records() {
-        for is_probe in [false, true] {
+        for flags in 0..4 {
+            let (is_probe, is_limited) = (flags & 1 != 0, flags & 2 != 0);
             let preamble = Preamble {
                 path: 0x0102,
                 number: 0x0304_0506,
                 sent_us: 0x0708_090a,
                 is_probe,
+                is_limited,
             };
             let mut bytes = preamble.to_bytes().to_vec();
-            assert_eq!(bytes[..4], [2, 1, u8::from(is_probe), 0]);
+            assert_eq!(bytes[..4], [2, 1, flags, 0]);
             bytes.extend([9; 3]);
             let (read, records) = Records::open(&bytes, None).unwrap();
             assert_eq!(read, preamble);
             assert_eq!(records.count(), usize::from(!is_probe));
         }
-        assert!(Records::open(&[0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0], None).is_none());
+        assert!(Records::open(&[0, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0], None).is_none());
         assert!(Records::open(&[0; 11], None).is_none());
     }
 

@@ -762,6 +762,7 @@ fn records(input: &mut Input<'_>) -> Vec<u8> {
         number: input.word(),
         sent_us: input.word(),
         is_probe: false,
+        is_limited: true,
     };
     let mut plaintext = preamble.to_bytes().to_vec();
     for _ in 0..=input.byte() % 4 {
