@@ -36,14 +36,15 @@ mod queue;
 mod reassembly;
 mod receiver;
 mod reception;
+mod reporter;
 mod sender;
 mod shares;
 mod stream;
 mod transfer;
 
 pub use books::{Books, SentBooks, SourceBooks};
-pub(crate) use congestion::Progress;
 pub use receiver::{Receiver, ReceiverConfig, ReceiverCounters};
+pub(crate) use reporter::Progress;
 pub use sender::{Sender, SenderConfig, SenderCounters, StreamCounters};
 
 /// Where a stream goes and how often.

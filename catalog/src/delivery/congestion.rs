@@ -11,9 +11,9 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use ddx_wire::Time;
-use ddx_wire::message::ReportEntry;
 
 use super::pace::Used;
+use super::reporter::{Progress, Way};
 
 /// The rate of one path.
 #[derive(Debug)]
@@ -52,62 +52,6 @@ pub(super) struct Congestion {
     before_silence: Option<f64>,
     /// What arrives of this sender, as a multiple of the mean of all that share the path.
     share: f64,
-}
-
-/// What one report adds to the one before.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Progress {
-    /// Time between the two, by the reporter's clock.
-    pub(super) span: Duration,
-    /// Datagrams that arrived.
-    pub(crate) received: u32,
-    /// Datagrams that did not.
-    pub(crate) missing: u32,
-    /// Bytes that arrived.
-    pub(super) bytes: u32,
-    /// Number of the newest datagram of the report before.
-    pub(super) from: u32,
-}
-
-/// How the time on the way compares with the least of late.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Way {
-    /// What it is longer: what has piled up.
-    pub(super) queue: Duration,
-    /// What it is shorter.
-    shorter: Duration,
-    /// What arrives by it, in thousandths of the mean of all senders that share it, as far as its end can tell.
-    share: u16,
-}
-
-/// One host that reports about a path, and what it said.
-#[derive(Debug)]
-pub(super) struct Reporter {
-    last: ReportEntry,
-    /// How long the fastest datagram of the newest report and the report took together, without what the report waited.
-    round_trip: Option<Duration>,
-    /// What left before this has come, or never will.
-    pub(super) seen: Option<Time>,
-    /// The first time on the way that it told: others are compared with it, since its clock has a zero of its own.
-    zero: u32,
-    least: Least,
-    /// What its newest report came to, and when.
-    strain: Option<(Strain, Time)>,
-}
-
-/// How hard a path is for one reporter.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Strain {
-    queue: Duration,
-    loss: f64,
-}
-
-/// Least value of the last ten to twenty seconds.
-#[derive(Debug, Default)]
-struct Least {
-    present: Option<i64>,
-    former: Option<i64>,
-    since: Time,
 }
 
 impl Congestion {
@@ -432,127 +376,6 @@ impl Congestion {
     }
 }
 
-impl Progress {
-    /// Share of datagrams that did not arrive.
-    fn loss(&self) -> f64 {
-        let all = f64::from(self.received) + f64::from(self.missing);
-        f64::from(self.missing) / all.max(1.0)
-    }
-
-    /// What `next` adds to `last`, two reports of one reporter; `None` if it adds nothing.
-    pub(crate) fn between(last: &ReportEntry, next: &ReportEntry) -> Option<Self> {
-        let span = next.at_us.wrapping_sub(last.at_us);
-        let received = next.received.wrapping_sub(last.received);
-        let passed = next.highest.wrapping_sub(last.highest);
-        // Half of the range: the later of two is less than that ahead.
-        let is_later = |step: u32| step < 1 << 31;
-        if received == 0 || !is_later(received) || !is_later(passed) || !is_later(span) {
-            return None;
-        }
-        Some(Self {
-            span: Duration::from_micros(span.into()),
-            received,
-            missing: passed.saturating_sub(received),
-            bytes: next.bytes.wrapping_sub(last.bytes),
-            from: last.highest,
-        })
-    }
-}
-
-impl Reporter {
-    pub(super) fn new(first: ReportEntry, now: Time) -> Self {
-        let mut least = Least::default();
-        least.update(0, now);
-        Self {
-            zero: first.delay_us,
-            round_trip: round_trip(&first, now),
-            seen: None,
-            last: first,
-            least,
-            strain: None,
-        }
-    }
-
-    /// How long it takes until a datagram is reported, with what has piled up on the way.
-    pub(super) fn round_trip(&self) -> Option<Duration> {
-        self.round_trip
-    }
-
-    /// Takes in a report: what it adds to the one before, and how much longer datagrams took than the fastest of late.
-    pub(super) fn handle_report(
-        &mut self,
-        report: &ReportEntry,
-        now: Time,
-    ) -> Option<(Progress, Way)> {
-        let progress = Progress::between(&self.last, report);
-        if 8 * u32::from(self.last.longest) < 7 * u32::from(report.longest) {
-            // Longer ones take longer: only like is compared.
-            self.least = Least::default();
-        }
-        self.last = *report;
-        self.round_trip = round_trip(report, now);
-        let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
-        let before = self.least.get();
-        let least = self.least.update(delay, now);
-        let micros = |span: i64| Duration::from_micros(u64::try_from(span).unwrap_or(0));
-        let queue = micros(delay.saturating_sub(least));
-        let shorter = micros(before.unwrap_or(delay).saturating_sub(delay));
-        let progress = progress?;
-        let loss = progress.loss();
-        self.strain = Some((Strain { queue, loss }, now));
-        let share = report.share;
-        Some((
-            progress,
-            Way {
-                queue,
-                shorter,
-                share,
-            },
-        ))
-    }
-
-    /// How hard the path is for it, if it said so of late.
-    pub(super) fn strain(&self, now: Time) -> Option<Strain> {
-        let (strain, at) = self.strain?;
-        (now.since(at) < STRAIN_LASTS).then_some(strain)
-    }
-}
-
-impl Strain {
-    /// Whether what slows the path down for one reporter is not seen by this other one: it lies behind the group.
-    pub(super) fn is_not_shared_by(&self, other: &Self) -> bool {
-        let is_strained = self.queue >= 2 * QUEUE_LOW_MAX || self.loss > other.loss + LOSS_STEP;
-        is_strained && other.queue <= QUEUE_LOW_MAX && other.loss <= self.loss
-    }
-}
-
-/// The receiver's clock is in both times of a report, and falls out.
-fn round_trip(report: &ReportEntry, now: Time) -> Option<Duration> {
-    let now_us = u32::try_from((now.0 / 1_000) & u64::from(u32::MAX)).unwrap_or_default();
-    let micros = now_us
-        .wrapping_sub(report.at_us)
-        .wrapping_add(report.delay_us);
-    let round_trip = Duration::from_micros(micros.into());
-    (round_trip <= ROUND_TRIP_MAX).then_some(round_trip)
-}
-
-impl Least {
-    fn get(&self) -> Option<i64> {
-        self.present.into_iter().chain(self.former).min()
-    }
-
-    /// Takes in a value; the least one of late.
-    fn update(&mut self, value: i64, now: Time) -> i64 {
-        if now.since(self.since) >= WINDOW {
-            self.former = self.present.take();
-            self.since = now;
-        }
-        let present = self.present.map_or(value, |least| least.min(value));
-        self.present = Some(present);
-        self.former.map_or(present, |former| former.min(present))
-    }
-}
-
 fn permille(share: f64) -> u16 {
     #[expect(
         clippy::cast_possible_truncation,
@@ -580,7 +403,7 @@ const DATAGRAM: f64 = 1_500.0;
 /// Growth of the time on the way that says nothing, whatever the jitter: what a paced batch takes.
 const QUEUE_LOW_MIN: Duration = Duration::from_micros(200);
 /// Growth that says something, whatever the jitter: twice as much is a third of what queues on the way should hold.
-const QUEUE_LOW_MAX: Duration = Duration::from_millis(15);
+pub(super) const QUEUE_LOW_MAX: Duration = Duration::from_millis(15);
 /// A guess for a path that was never used.
 const JITTER_FIRST: Duration = Duration::from_millis(1);
 /// How long what has piled up may take to drain: some of the times that it takes to see that.
@@ -594,7 +417,7 @@ const KEPT_UP: f64 = 0.9;
 const TRY_PAUSE_MIN: Duration = Duration::from_millis(250);
 const TRY_PAUSE_MAX: Duration = Duration::from_millis(500);
 /// Loss beyond the usual that means a full path whose queue is too short to show.
-const LOSS_STEP: f64 = 0.15;
+pub(super) const LOSS_STEP: f64 = 0.15;
 /// Least growth in the time until it is seen: a part of a datagram.
 const STEP_BYTES: f64 = 60.0;
 /// Multiple of what the path carried when it was full, above which it is another path.
@@ -608,12 +431,6 @@ const ARRIVED_DATAGRAMS: u32 = 8;
 const ARRIVED_SPAN: Duration = Duration::from_millis(100);
 /// Reports that are remembered for it at most.
 const ARRIVED_REPORTS: usize = 32;
-/// What takes longer is an error of a peer.
-const ROUND_TRIP_MAX: Duration = Duration::from_secs(10);
-/// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
-const WINDOW: Duration = Duration::from_secs(10);
-/// Reports come every 50 ms while there is enough to report.
-const STRAIN_LASTS: Duration = Duration::from_millis(500);
 /// Nothing heard for so long, though much was sent.
 const SILENCE: Duration = Duration::from_millis(500);
 
@@ -757,62 +574,5 @@ mod tests {
         let (way, used) = (Way::default(), Used::default());
         congestion.handle_report(&progress, way, used, Duration::ZERO, 0, now);
         assert_eq!(congestion.rate(), 6_250_000);
-    }
-
-    #[test]
-    fn reports_come_round() {
-        let last = ReportEntry {
-            path: 1,
-            highest: u32::MAX,
-            received: u32::MAX - 1,
-            bytes: u32::MAX,
-            delay_us: 7,
-            at_us: u32::MAX - 999,
-            longest: 1200,
-            share: 1_000,
-        };
-        let next = ReportEntry {
-            highest: 9,
-            received: 3,
-            bytes: 99,
-            delay_us: u32::MAX,
-            at_us: 0,
-            ..last
-        };
-        let progress = Progress::between(&last, &next).unwrap();
-        assert_eq!((progress.received, progress.missing), (5, 5));
-        assert_eq!(
-            (progress.bytes, progress.span),
-            (100, Duration::from_millis(1))
-        );
-        assert_eq!(Progress::between(&next, &last), None);
-    }
-
-    #[test]
-    fn the_queue_is_what_is_longer_than_the_least_of_late() {
-        let report = |number: u32, delay_us: u32| ReportEntry {
-            path: 1,
-            highest: number,
-            received: number,
-            bytes: number * 1_000,
-            delay_us,
-            at_us: number * 1_000,
-            longest: 1_000,
-            share: 1_000,
-        };
-        let mut reporter = Reporter::new(report(1, 1_000), Time(0));
-        let mut queue = |number, delay_us, s: u64| {
-            let at = Time(s * 1_000_000_000);
-            let heard = reporter.handle_report(&report(number, delay_us), at);
-            let way = heard.unwrap().1;
-            (way.queue.as_micros(), way.shorter.as_micros())
-        };
-        assert_eq!(queue(2, 1_400, 1), (400, 0));
-        assert_eq!(queue(3, 800, 2), (0, 200));
-        assert_eq!(queue(4, u32::MAX - 99, 3), (0, 900), "below zero");
-        assert_eq!(queue(5, 900, 4), (1_000, 0));
-        // Forgotten after twenty seconds.
-        assert_eq!(queue(6, 900, 30), (1_000, 0));
-        assert_eq!(queue(7, 900, 60).0, 0);
     }
 }

@@ -3,6 +3,7 @@
 //! Next to nothing is queued here: what the path cannot take now stays in the store, and is read again when it can, the
 //! newest first. Streams take turns by weight, counted in bytes.
 
+mod gone;
 mod reports;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -14,11 +15,12 @@ use ddx_wire::seal::{Lane, Sealer};
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::SentBooks;
-use super::congestion::{Congestion, Reporter};
+use super::congestion::Congestion;
 use super::flow::{Flow, Progress};
 use super::pace::{Pace, batch_bytes, span_of};
 use super::parity;
 use super::queue::{DATAGRAM_OVERHEAD, Limit, Queue};
+use super::reporter::Reporter;
 use super::sender::FIRST_UNICAST;
 use super::transfer::Transfer;
 use super::{Fetch, PathStatus, Transmit, Want};
@@ -343,15 +345,6 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             flow.give_up(fetch.want);
         }
         self.take_turns(stream);
-    }
-
-    /// Tells that the contract keeps a sample back, of a stream of which each is wanted.
-    pub(super) fn leave_out(&mut self, stream: StreamId, meta: &SampleMeta) {
-        if let Some(flow) = self.flows.get_mut(&stream)
-            && flow.leave_out(meta)
-        {
-            self.push_left_out(stream, meta);
-        }
     }
 
     /// Something newer than what was offered here lies in the store.
@@ -689,43 +682,6 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             }
             self.lanes[REPEATS].push_padding(len);
         }
-    }
-
-    /// Where each sample is wanted, tells what the ring let go before this one.
-    fn tell_gap(&mut self, stream: StreamId, meta: &SampleMeta) {
-        let flow = self.flows.get(&stream).filter(|flow| flow.is_every());
-        if let Some((epoch, Seq(last))) = flow.and_then(Flow::sent)
-            && epoch == meta.epoch
-            && meta.seq.0 > last + 1
-        {
-            let gone = SampleMeta {
-                epoch,
-                seq: Seq(meta.seq.0 - 1),
-                ..SampleMeta::default()
-            };
-            self.push_gone(stream, &gone, meta.seq.0 - last - 1);
-        }
-    }
-
-    fn push_left_out(&mut self, stream: StreamId, meta: &SampleMeta) {
-        let left_out = SampleMeta {
-            filtered: 1,
-            ..*meta
-        };
-        self.push_gone(stream, &left_out, 1);
-    }
-
-    fn push_gone(&mut self, stream: StreamId, meta: &SampleMeta, count: u64) {
-        let others = count.saturating_sub(1).to_le_bytes();
-        let record = Record {
-            stream,
-            repeat: true,
-            gone: true,
-            meta: *meta,
-            fragment: None,
-            payload: &others,
-        };
-        self.lanes[REPEATS].push(&record, self.datagram_bytes);
     }
 
     fn forget_turns(&mut self, stream: StreamId) {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use ddx_wire::message::ReportEntry;
 use ddx_wire::{Tag, Time};
 
-use super::super::congestion::Reporter;
+use super::super::reporter::Reporter;
 use super::super::sender::FIRST_UNICAST;
 use super::super::transfer::Flight;
 use super::Path;
