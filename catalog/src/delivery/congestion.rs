@@ -33,6 +33,8 @@ pub(super) struct Congestion {
     arrived: VecDeque<(Progress, bool)>,
     /// What the path carried when it was last full; none before, when the rate is a guess.
     ceiling: Option<f64>,
+    /// The share of others that it had then.
+    ceiling_share: f64,
     /// Steps in a row beyond the ceiling without a sign of a full path.
     beyond: u32,
     /// When it may be tried next whether the path carries more, and how long after the last time.
@@ -65,6 +67,7 @@ impl Congestion {
             jitter: JITTER_FIRST,
             arrived: VecDeque::new(),
             ceiling: None,
+            ceiling_share: 1.0,
             beyond: 0,
             try_at: now,
             try_pause: TRY_PAUSE_MIN,
@@ -125,7 +128,7 @@ impl Congestion {
             shorter,
             share,
         } = way;
-        self.share = (f64::from(share) / 1_000.0).clamp(SHARE_MIN, SHARE_MAX);
+        self.share = share.clamp(SHARE_MIN, SHARE_MAX);
         let queue_before = std::mem::replace(&mut self.queue, queue);
         if queue_before <= self.queue_low() && !self.is_trying(used) {
             self.note_jitter(queue.saturating_sub(queue_before));
@@ -149,15 +152,17 @@ impl Congestion {
             (self.ceiling, self.beyond) = (None, 0);
         }
 
-        let chance = (self.loss * (1.0 - self.loss) / datagrams).sqrt();
+        let both = f64::midpoint(self.loss, lost);
+        let chance = (both * (1.0 - both) / datagrams).sqrt();
         let enough = datagrams >= f64::from(ARRIVED_DATAGRAMS);
-        let drops = enough && lost > self.loss + LOSS_STEP + chance;
+        let drops = enough && lost > self.loss + LOSS_STEP + 2.0 * chance;
         // In the report after the one that is on its way now.
         let seen_after = progress.span + round_trip;
         let low = self.queue_low();
         let full = match self.ceiling {
             // What piles up although the sender had little to send is not its own.
-            _ if !self.limited => 2 * QUEUE_LOW_MAX,
+            _ if !self.limited && self.share < SHARE_MUCH => 2 * QUEUE_LOW_MAX,
+            _ if self.share >= SHARE_MUCH => low,
             // The steps are large.
             None => low,
             // One report may be late for reasons of its own.
@@ -178,6 +183,13 @@ impl Congestion {
         } else {
             let weight = (datagrams / f64::from(ARRIVED_DATAGRAMS)).min(1.0);
             self.loss += (lost - self.loss) * weight / 8.0;
+            if let Some(ceiling) = self.ceiling
+                && self.share > 1.5 * self.ceiling_share
+            {
+                // Those who had more are gone, or have less now: there is room for so much at least.
+                self.ceiling = Some(ceiling * self.share / self.ceiling_share);
+                self.ceiling_share = self.share;
+            }
             if self.queue > low {
                 self.draw_back(capacity, seen_after, now);
             } else if self.limited && now >= self.grown_at.max(self.slowed_at) + seen_after {
@@ -252,7 +264,7 @@ impl Congestion {
             }
             _ => capacity,
         };
-        self.ceiling = Some(self.yielding(1.0) * carries);
+        (self.ceiling, self.ceiling_share) = (Some(self.yielding(1.0) * carries), self.share);
         let lowered = (capacity.min(carries) * share).min(self.bytes_per_second * least);
         self.bytes_per_second *= self.yielding(lowered / self.bytes_per_second);
     }
@@ -286,7 +298,7 @@ impl Congestion {
             ..2.0 => (ceiling + capacity) / 2.0,
             _ => capacity,
         };
-        self.ceiling = Some(self.yielding(1.0) * ceiling);
+        (self.ceiling, self.ceiling_share) = (Some(self.yielding(1.0) * ceiling), self.share);
         let lowered = self.share_to_drain(seen_after) * ceiling;
         self.bytes_per_second *= self.yielding((lowered / self.bytes_per_second).min(1.0));
         self.try_pause = if self.beyond > 0 {
@@ -422,6 +434,8 @@ pub(super) const LOSS_STEP: f64 = 0.15;
 const STEP_BYTES: f64 = 60.0;
 /// Multiple of what the path carried when it was full, above which it is another path.
 const BEYOND: f64 = 1.15;
+/// Who has so much of what others share makes room for them as soon as something piles up.
+const SHARE_MUCH: f64 = 1.2;
 /// Bounds of the share that a sender believes.
 const SHARE_MIN: f64 = 0.25;
 const SHARE_MAX: f64 = 3.0;
@@ -484,7 +498,7 @@ mod tests {
             };
             let way = Way {
                 queue,
-                share: 1_000,
+                share: 1.0,
                 ..Way::default()
             };
             congestion.handle_report(&progress, way, used, round_trip, 0, now);

@@ -15,7 +15,7 @@ use ddx_wire::seal::{Lane, Sealer};
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 use super::books::SentBooks;
-use super::congestion::Congestion;
+use super::congestion::{Congestion, QUEUE_LOW_MAX};
 use super::flow::{Flow, Progress};
 use super::pace::{Pace, batch_bytes, span_of};
 use super::parity;
@@ -470,6 +470,11 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         self.pace.blocked_until(now + ahead).map(|at| at - ahead)
     }
 
+    /// Whether more piles up on the way than jitter explains.
+    pub(super) fn is_strained(&self) -> bool {
+        self.congestion.queue() > QUEUE_LOW_MAX
+    }
+
     /// Whether a command is about to leave, which waits for the rate only if there are many.
     pub(super) fn has_command(&self) -> bool {
         self.lanes[COMMANDS].is_ready()
@@ -677,7 +682,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         self.probes = self.probes.saturating_add(1);
         let lengths = [ETHERNET_BYTES, self.datagram_bytes_max];
         for len in lengths.map(|len| len.min(self.datagram_bytes_max)) {
-            if len <= self.datagram_bytes {
+            if len <= self.datagram_bytes || span_of(len, self.congestion.rate()) > PROBE_SPAN {
                 continue;
             }
             self.lanes[REPEATS].push_padding(len);
@@ -757,5 +762,7 @@ const PROBE_PAUSES: [Duration; 4] = [
     Duration::from_secs(3),
 ];
 const PROBE_PAUSE: Duration = Duration::from_secs(10);
+/// A length that takes longer is not tried: on a slow path that costs more than it gains.
+const PROBE_SPAN: Duration = Duration::from_millis(10);
 /// So much may be sent without a report before their absence means something: receivers report each 2 KiB.
 const SILENT_BYTES: usize = 16 << 10;

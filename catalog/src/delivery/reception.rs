@@ -15,7 +15,7 @@ use super::shares::Shares;
 pub(super) struct Reception {
     paths: BTreeMap<(Tag, u16), Path>,
     due: Deadlines<(Tag, u16)>,
-    shares: Shares,
+    shares: Shares<Tag>,
 }
 
 #[derive(Debug)]
@@ -39,7 +39,7 @@ impl Reception {
         Self {
             paths: BTreeMap::new(),
             due: Deadlines::new(),
-            shares: Shares::default(),
+            shares: Shares::new(Time(0)),
         }
     }
 

@@ -6,6 +6,7 @@ use ddx_wire::Time;
 use ddx_wire::message::ReportEntry;
 
 use super::congestion::{LOSS_STEP, QUEUE_LOW_MAX};
+use super::shares::EVEN;
 
 /// What one report adds to the one before.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,14 +24,14 @@ pub(crate) struct Progress {
 }
 
 /// How the time on the way compares with the least of late.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Way {
     /// What it is longer: what has piled up.
     pub(super) queue: Duration,
     /// What it is shorter.
     pub(super) shorter: Duration,
-    /// What arrives by it, in thousandths of the mean of all senders that share it, as far as its end can tell.
-    pub(super) share: u16,
+    /// What it has, as a multiple of the mean of all that share its link, as far as its ends can tell.
+    pub(super) share: f64,
 }
 
 /// One host that reports about a path, and what it said.
@@ -113,6 +114,7 @@ impl Reporter {
     pub(super) fn handle_report(
         &mut self,
         report: &ReportEntry,
+        own_share: u16,
         now: Time,
     ) -> Option<(Progress, Way)> {
         let progress = Progress::between(&self.last, report);
@@ -131,7 +133,8 @@ impl Reporter {
         let progress = progress?;
         let loss = progress.loss();
         self.strain = Some((Strain { queue, loss }, now));
-        let share = report.share;
+        // The link of either end may be the one that is full.
+        let share = f64::from(report.share) * f64::from(own_share) / f64::from(EVEN).powi(2);
         Some((
             progress,
             Way {
@@ -239,7 +242,7 @@ mod tests {
         let mut reporter = Reporter::new(report(1, 1_000), Time(0));
         let mut queue = |number, delay_us, s: u64| {
             let at = Time(s * 1_000_000_000);
-            let heard = reporter.handle_report(&report(number, delay_us), at);
+            let heard = reporter.handle_report(&report(number, delay_us), EVEN, at);
             let way = heard.unwrap().1;
             (way.queue.as_micros(), way.shorter.as_micros())
         };

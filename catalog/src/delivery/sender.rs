@@ -12,6 +12,7 @@ use ddx_wire::{Delivery, Epoch, Seq, StreamId, Tag, Time};
 use super::books::{SentBooks, SourceBooks};
 use super::deadlines::Deadlines;
 use super::path::{Offered, Path, PathLimits};
+use super::shares::Shares;
 use super::stream::{Reader, Stream};
 use super::{
     Due, Fetch, PathStatus, Route, SenderEvent, TimerName, Transmit, Via, group_number, key,
@@ -52,6 +53,8 @@ pub struct Sender<P> {
     hungry: BTreeSet<SocketAddr>,
     round_trips: BTreeMap<Tag, Duration>,
     repeats: Deadlines<StreamId>,
+    /// What part of this host's own link each path has, as far as its queue tells.
+    shares: Shares<SocketAddr>,
     counters: SenderCounters,
     now: Time,
 }
@@ -98,6 +101,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             hungry: BTreeSet::new(),
             round_trips: BTreeMap::new(),
             repeats: Deadlines::new(),
+            shares: Shares::new(now),
             counters: SenderCounters::default(),
             now,
         }
@@ -328,9 +332,11 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
     /// Takes in how a reader's host receives.
     pub fn handle_report(&mut self, tag: Tag, report: &ReportEntry, now: Time) {
         self.now = now;
-        let path = self.numbers.get(&report.path);
-        if let Some(path) = path.and_then(|to| self.paths.get_mut(to)) {
-            path.handle_report(tag, report, now);
+        if let Some(to) = self.numbers.get(&report.path)
+            && let Some(path) = self.paths.get_mut(to)
+        {
+            let share = self.shares.of(*to, now);
+            path.handle_report(tag, report, share, now);
         }
     }
 
@@ -425,6 +431,8 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         let path = self.paths.get_mut(&to)?;
         let transmit = path.poll_transmit(&mut self.sealer, out, self.now);
         let left = path.take_left();
+        self.shares
+            .note(to, out.len(), path.is_strained(), self.now);
         self.hungry.insert(to);
         enlist(&mut self.ready, &self.blocked, to);
         for (stream, epoch, seq) in left {

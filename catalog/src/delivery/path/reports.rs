@@ -49,11 +49,13 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         earlier.next().map(|(_, at)| *at)
     }
 
-    /// Takes in how datagrams arrive.
+    /// Takes in how datagrams arrive. `own_share` is what the path has of this host's link, in thousandths of the mean of its
+    /// paths.
     pub(in crate::delivery) fn handle_report(
         &mut self,
         from: Tag,
         report: &ReportEntry,
+        own_share: u16,
         now: Time,
     ) {
         let longest = usize::from(report.longest).min(self.datagram_bytes_max);
@@ -67,7 +69,7 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             return;
         };
         reporter.seen = reporter.seen.max(departed);
-        if let Some((progress, way)) = reporter.handle_report(report, now) {
+        if let Some((progress, way)) = reporter.handle_report(report, own_share, now) {
             let round_trip = reporter.round_trip().unwrap_or(self.round_trip + way.queue);
             if self.is_slow_for_one(from, now) {
                 return;
