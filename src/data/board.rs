@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use ddx_catalog::delivery::{Books, PathStatus, SentBooks, SourceBooks};
+use ddx_catalog::delivery::{Books, PathStatus, SenderCounters, SentBooks, SourceBooks};
 use ddx_wire::{StreamId, Tag, Time};
 
 /// How often a thread that has something to do puts up its books.
@@ -18,6 +18,7 @@ pub(crate) const PERIOD: Duration = Duration::from_millis(500);
 pub(crate) struct Board {
     outward: Mutex<Outward>,
     inward: Mutex<Inward>,
+    sent: Mutex<SenderCounters>,
 }
 
 /// What the sending thread has counted.
@@ -60,6 +61,15 @@ impl Board {
     /// Puts up what the receiving thread has counted.
     pub(crate) fn put_inward(&self, inward: Inward) {
         put(&self.inward, inward, |books| &mut books.at);
+    }
+
+    /// Puts up what the sender has done. These are not books: they move also when nothing new is sent.
+    pub(crate) fn put_sent(&self, sent: SenderCounters) {
+        *self.sent.lock().unwrap_or_else(PoisonError::into_inner) = sent;
+    }
+
+    pub(crate) fn sent(&self) -> SenderCounters {
+        get(&self.sent)
     }
 
     pub(crate) fn outward(&self) -> Outward {

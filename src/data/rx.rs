@@ -21,7 +21,8 @@ use super::board::{self, Board, Inward, Mirrored};
 use super::{Traffic, count, mailbox};
 use crate::net::Channel;
 
-/// Orders that wait for the thread at most; each is small and taken at the next wake-up.
+/// Orders that wait for the thread at most, of 2 KiB at most and taken at the next wake-up: 8 MiB. While they are so many
+/// the control loop waits.
 const ORDERS: usize = 4096;
 /// How long the control loop waits for a data thread: it takes its orders between two batches.
 const PATIENCE: Duration = Duration::from_secs(1);

@@ -21,7 +21,8 @@ use super::board::{self, Board, Outward};
 use super::{Traffic, count, mailbox};
 use crate::net::Channel;
 
-/// Orders that wait for the thread at most; each is small and taken at the next wake-up.
+/// Orders that wait for the thread at most, taken at the next wake-up: 4 MiB, as none but a route of many readers has more
+/// than 1 KiB. While they are so many the control loop waits.
 const ORDERS: usize = 4096;
 /// How long the control loop waits for a data thread: it takes its orders between two batches.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -199,6 +200,7 @@ impl State {
     fn show(&mut self, now: Time) {
         if now.since(self.shown) >= board::PERIOD {
             self.shown = now;
+            self.board.put_sent(self.sender.counters());
             self.board.put_outward(Outward {
                 at: now,
                 sources: self.sender.source_books().collect(),

@@ -386,14 +386,20 @@ fn counters(network: &Network) -> Value {
     for (reason, count) in network.received().refused.iter() {
         add(format!("data_{}", refused(reason)), count);
     }
-    add(
-        "data_unwanted_records".to_owned(),
-        network.received().unwanted_records,
-    );
-    add(
-        "data_refused_streams".to_owned(),
-        network.received().refused_streams,
-    );
+    let (received, sent) = (network.received(), network.board().sent());
+    for (what, count) in [
+        ("unwanted_records", received.unwanted_records),
+        ("refused_streams", received.refused_streams),
+        ("dropped_nacks", received.dropped_nacks),
+        ("dropped_gone", received.dropped_gone),
+        ("unreported_datagrams", received.unreported_datagrams),
+        ("unsent_streams", sent.refused_streams),
+        ("unsent_readers", sent.refused_readers),
+        ("dropped_requests", sent.dropped_requests),
+        ("dropped_records", sent.dropped_records),
+    ] {
+        add(format!("data_{what}"), count);
+    }
     counters.into()
 }
 

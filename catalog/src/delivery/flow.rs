@@ -24,6 +24,8 @@ pub(super) struct Flow<P> {
     pub(super) urgent: bool,
     /// Samples that were asked for again, in order.
     gaps: VecDeque<Gap>,
+    /// Requests that found no room among these.
+    dropped_gaps: u64,
     /// Large samples, the newest last.
     pub(super) transfers: VecDeque<Transfer<P>>,
 }
@@ -57,6 +59,7 @@ impl<P: AsRef<[u8]>> Flow<P> {
             waits: None,
             urgent: false,
             gaps: VecDeque::new(),
+            dropped_gaps: 0,
             transfers: VecDeque::new(),
         }
     }
@@ -243,9 +246,19 @@ impl<P: AsRef<[u8]>> Flow<P> {
                 && last <= known.last
                 && known.parts == gap.parts
         });
-        if !known && self.gaps.len() < GAPS {
-            self.gaps.push_back(gap);
+        if known {
+            return;
         }
+        if self.gaps.len() < GAPS {
+            self.gaps.push_back(gap);
+        } else {
+            self.dropped_gaps = self.dropped_gaps.saturating_add(1);
+        }
+    }
+
+    /// Requests for repair that found no room.
+    pub(super) fn dropped_gaps(&self) -> u64 {
+        self.dropped_gaps
     }
 
     /// The store gave `found` for the first sample of the first gap; `None` is nothing newer either. Returns how many
@@ -314,7 +327,7 @@ pub(super) struct Filled {
 const WEIGHT_UNIT: u64 = 16;
 /// How long the samples of a burst wait their turn before the newest alone counts.
 const BURST: Duration = Duration::from_millis(20);
-/// Gaps of one stream on one path that wait for repair.
+/// Gaps of one stream on one path that wait for repair, of at most 900 B each: 225 KiB.
 const GAPS: usize = 256;
 /// Large samples kept for repair: the one under way, and the one before.
 const KEPT: usize = 2;

@@ -103,7 +103,7 @@ impl Order {
         }
     }
 
-    /// Bytes held back.
+    /// Bytes held back, with what each entry takes beside its payload: nothing is held where there are none.
     pub(super) fn held_bytes(&self) -> usize {
         self.held_bytes
     }
@@ -111,7 +111,7 @@ impl Order {
     /// Takes a sample that is lacking.
     pub(super) fn insert(&mut self, meta: SampleMeta, payload: Vec<u8>, wait: Duration, now: Time) {
         self.begin(meta.epoch, meta.seq);
-        self.held_bytes += payload.len();
+        self.held_bytes += cost(payload.len());
         self.held.insert(meta.seq, Held::Sample(meta, payload));
         self.last = (now, wait);
     }
@@ -137,6 +137,7 @@ impl Order {
         let until = self.held.range(first..).next().map(|(seq, _)| *seq);
         let last = until.map_or(last, |seq| last.min(Seq(seq.0 - 1)));
         if first <= last {
+            self.held_bytes += cost(0);
             self.held.insert(first, Held::Gone(last, why));
         }
         self.last = (now, wait);
@@ -158,11 +159,12 @@ impl Order {
         (self.ask_at, self.asked) = (None, 0);
         match held {
             Held::Sample(meta, payload) => {
-                self.held_bytes -= payload.len();
+                self.held_bytes -= cost(payload.len());
                 self.next = Some(Seq(at.0.saturating_add(1)));
                 Some(Next::Sample(meta, payload))
             }
             Held::Gone(last, why) => {
+                self.held_bytes -= cost(0);
                 self.next = Some(Seq(last.0.saturating_add(1)));
                 Some(Next::Gone(last.0 - at.0 + 1, why))
             }
@@ -264,6 +266,11 @@ impl Order {
     }
 }
 
+/// What holding back a payload of `len` bytes takes, or with 0 the news that samples are gone.
+pub(super) fn cost(len: usize) -> usize {
+    len + ENTRY_BYTES
+}
+
 /// Whether `meta` begins a later epoch than `order` is in.
 pub(super) fn is_later_epoch(order: &Order, meta: &SampleMeta) -> bool {
     order.next.is_some() && key(meta).0 > order.epoch
@@ -273,6 +280,8 @@ pub(super) fn is_later_epoch(order: &Order, meta: &SampleMeta) -> bool {
 const AGAIN: Duration = Duration::from_millis(10);
 /// `PROTOCOL.md#every-sample`: a sample is asked for during 5 s, or 16 round trips.
 const GIVE_UP: Duration = Duration::from_secs(5);
+/// What an entry takes beside its payload, so that many empty ones count too.
+const ENTRY_BYTES: usize = 128;
 /// Gaps asked for at one time.
 const GAPS: usize = 32;
 

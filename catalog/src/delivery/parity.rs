@@ -210,11 +210,13 @@ mod tests {
     use ddx_wire::sample::{Record, SampleMeta};
     use ddx_wire::{Seq, StreamId, Tag, Time};
 
-    use super::super::reassembly::{Due, Reassembly, Rules, Step};
+    use super::super::reassembly::{Due, PARTIAL_BYTES, RANGE_BYTES, Reassembly, Rules, Step};
     use super::super::transfer::{Flight, Transfer};
     use super::*;
 
     const RTT: Duration = Duration::from_millis(100);
+    /// What a sample in one range takes beside its bytes.
+    const BESIDE: usize = PARTIAL_BYTES + RANGE_BYTES;
     const FLIGHT: Flight = Flight {
         time: RTT,
         seen: None,
@@ -328,10 +330,11 @@ mod tests {
     #[test]
     fn parities_are_kept_within_the_budget() {
         let transfer = Transfer::new(meta(), sample(), 100, Time(0));
-        let (mut transfer, mut reassembly) = (transfer.protect(9), Reassembly::new(995 + 250));
+        let (mut transfer, mut reassembly) =
+            (transfer.protect(9), Reassembly::new(BESIDE + 995 + 250));
         let (_, step) = carry(&mut transfer, &mut reassembly, |at| at < 300);
         assert_eq!(step, None);
-        assert_eq!(reassembly.held_bytes(), 995 + 200);
+        assert_eq!(reassembly.held_bytes(), BESIDE + 995 + 200);
     }
 
     fn parities(loss_permille: u16, mbit: u64, rtt_ms: u64, bytes: usize) -> u8 {

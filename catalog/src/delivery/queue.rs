@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use ddx_wire::StreamId;
-use ddx_wire::sample::{Last, PADDING, PREAMBLE_BYTES, Place, Preamble, Record};
+use ddx_wire::sample::{Last, PADDING, PREAMBLE_BYTES, Place, Preamble, RECORD_BYTES, Record};
 use ddx_wire::seal::{HEADER_BYTES, Lane, MIXED_STREAMS, SEAL_BYTES, Sealer};
 
 /// What every data datagram costs beside its records, bytes.
@@ -19,6 +19,7 @@ pub(super) struct Queue {
     head: usize,
     closed: VecDeque<Closed>,
     open: Option<Open>,
+    dropped: u64,
 }
 
 #[derive(Debug)]
@@ -66,8 +67,18 @@ impl Queue {
             .is_some_and(|open| self.bytes.len() - open.start + len + SEAL_BYTES <= datagram_bytes)
     }
 
-    /// Adds a record to the open datagram, or to a new one where it does not fit.
+    /// Records for which there was no room.
+    pub(super) fn dropped(&self) -> u64 {
+        self.dropped
+    }
+
+    /// Adds a record to the open datagram, or to a new one where it does not fit. Beyond [`QUEUE_BYTES`] it is dropped and
+    /// counted, as if the link had lost it.
     pub(super) fn push(&mut self, record: &Record<'_>, datagram_bytes: usize) {
+        if self.len() + RECORD_BYTES + record.payload.len() > QUEUE_BYTES {
+            self.dropped = self.dropped.saturating_add(1);
+            return;
+        }
         let end = self.bytes.len();
         let fits = |start: usize, bytes: &[u8]| bytes.len() - start + SEAL_BYTES <= datagram_bytes;
         // None of these can fail: what cannot be encoded is refused before it comes here.
@@ -189,5 +200,8 @@ impl Queue {
 
 /// A datagram is padded by at most this share of its length.
 const PADDED_SHARE: usize = 16;
+/// Bytes that may wait in one lane. Samples and fragments are only taken while there is less than a quarter of it, so this
+/// bounds what tells a reader of samples that it will not get.
+const QUEUE_BYTES: usize = 1 << 20;
 /// How much may have left a queue before what waits moves to the front of its buffer.
 const COMPACT_BYTES: usize = 65_536;

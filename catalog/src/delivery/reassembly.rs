@@ -117,11 +117,12 @@ impl Reassembly {
                 }
             }
             let total = usize::try_from(fragment.total).unwrap_or(usize::MAX);
-            if total > self.budget_bytes.saturating_sub(self.held_bytes) {
+            let room = self.budget_bytes.saturating_sub(self.held_bytes);
+            if total.saturating_add(PARTIAL_BYTES + RANGE_BYTES) > room {
                 // An older sample given up at the same time is left to the books as lost.
                 return Step::failed(record.meta, Failure::OverBudget);
             }
-            self.held_bytes += total;
+            self.held_bytes += total + PARTIAL_BYTES;
             let partial = Partial {
                 meta: record.meta,
                 bytes: vec![0; total],
@@ -143,7 +144,12 @@ impl Reassembly {
         let room = self.budget_bytes.saturating_sub(self.held_bytes);
         let before = partial.held_bytes();
         let added = partial.add(fragment, record.payload, room);
-        self.held_bytes += partial.held_bytes() - before;
+        self.held_bytes = self.held_bytes - before + partial.held_bytes();
+        if self.held_bytes > self.budget_bytes && !matches!(added, Added::Whole) {
+            // Its ranges alone: fragments that are honest leave few.
+            self.remove(place);
+            return Step::failed(record.meta, Failure::OverBudget);
+        }
         match added {
             Added::Whole => Step {
                 whole: self
@@ -199,7 +205,7 @@ impl Reassembly {
         self.partials.contains_key(place)
     }
 
-    /// Bytes of incomplete samples.
+    /// Bytes of incomplete samples, with what each takes beside its payload.
     #[cfg(test)]
     pub(super) fn held_bytes(&self) -> usize {
         self.held_bytes
@@ -279,7 +285,8 @@ enum Added {
 
 impl Partial {
     fn held_bytes(&self) -> usize {
-        self.bytes.len() + self.parities.len() * self.step
+        let ranges = self.ranges.len() * RANGE_BYTES;
+        self.bytes.len() + self.parities.len() * self.step + ranges + PARTIAL_BYTES
     }
 
     fn has_gap(&self) -> bool {
@@ -453,6 +460,10 @@ const TAIL: Duration = Duration::from_millis(25);
 const GIVE_UP: Duration = Duration::from_secs(2);
 /// Parts asked for at one time: four messages.
 const PARTS_MAX: usize = 4 * NACK_PARTS_MAX;
+/// What an incomplete sample takes beside its bytes, with its places in the tables, so that many small ones count too.
+pub(super) const PARTIAL_BYTES: usize = 512;
+/// What one range of it takes.
+pub(super) const RANGE_BYTES: usize = size_of::<(usize, usize)>();
 /// Gaps that fragments of any length may leave.
 const RANGES: usize = 64;
 
@@ -471,13 +482,24 @@ mod tests {
     }
 
     fn insert(r: &mut Reassembly, seq: u64, total: u32, offset: u32, payload: &[u8]) -> Step {
+        insert_into(r, STREAM, seq, total, offset, payload)
+    }
+
+    fn insert_into(
+        r: &mut Reassembly,
+        stream: StreamId,
+        seq: u64,
+        total: u32,
+        offset: u32,
+        payload: &[u8],
+    ) -> Step {
         let fragment = Fragment {
             total,
             offset,
             parities: 0,
         };
         let record = Record {
-            stream: STREAM,
+            stream,
             repeat: false,
             gone: false,
             meta: meta(seq),
@@ -495,7 +517,7 @@ mod tests {
 
     #[test]
     fn any_order_and_repeats_make_the_sample() {
-        let mut r = Reassembly::new(100);
+        let mut r = Reassembly::new(4_096);
         for (offset, part) in [(4, b"ef"), (0, b"ab"), (4, b"ef")] {
             assert_eq!(insert(&mut r, 1, 6, offset, part).whole, None);
         }
@@ -507,7 +529,7 @@ mod tests {
 
     #[test]
     fn newest_wins() {
-        let mut r = Reassembly::new(100);
+        let mut r = Reassembly::new(4_096);
         insert(&mut r, 1, 4, 0, b"ab");
         let step = insert(&mut r, 2, 4, 0, b"AB");
         assert_eq!(step.failed, Some((meta(1), Failure::Expired)));
@@ -520,7 +542,7 @@ mod tests {
     #[test]
     fn contradictions_drop_the_sample() {
         for (total, offset, payload) in [(5, 2, &b"cd"[..]), (4, 1, b"xx"), (9, 8, b"x")] {
-            let mut r = Reassembly::new(100);
+            let mut r = Reassembly::new(4_096);
             insert(&mut r, 1, 4, 0, b"ab");
             let step = insert(&mut r, 1, total, offset, payload);
             assert_eq!(step.failed, Some((meta(1), Failure::Undecodable)));
@@ -530,16 +552,34 @@ mod tests {
 
     #[test]
     fn budget_refuses_what_does_not_fit() {
-        let mut r = Reassembly::new(5);
+        let mut r = Reassembly::new(PARTIAL_BYTES + RANGE_BYTES + 5);
         let step = insert(&mut r, 1, 6, 0, b"ab");
         assert_eq!(step.failed, Some((meta(1), Failure::OverBudget)));
         assert_eq!(insert(&mut r, 2, 5, 0, b"ab").failed, None);
-        assert_eq!(r.held_bytes, 5);
+        assert_eq!(r.held_bytes, r.budget_bytes);
+    }
+
+    #[test]
+    fn what_samples_take_beside_their_bytes_is_within_the_budget_too() {
+        let mut r = Reassembly::new(10 * PARTIAL_BYTES);
+        let refused = (0..100).filter(|stream| {
+            let step = insert_into(&mut r, StreamId(*stream), 1, 2, 0, b"a");
+            step.failed == Some((meta(1), Failure::OverBudget))
+        });
+        assert_eq!(refused.count(), 91);
+        assert!(r.held_bytes <= r.budget_bytes);
+
+        // Of every second byte each leaves a range.
+        let mut r = Reassembly::new(PARTIAL_BYTES + 100_000 + 1_000 * RANGE_BYTES);
+        let steps = (0..2_000).map(|at| insert(&mut r, 1, 100_000, at * 2, b"a"));
+        let failed = steps.filter_map(|step| step.failed).next();
+        assert_eq!(failed, Some((meta(1), Failure::OverBudget)));
+        assert_eq!((r.held_bytes, r.deadline()), (0, None));
     }
 
     #[test]
     fn what_is_missing_is_asked_for_and_given_up_in_the_end() {
-        let mut r = Reassembly::new(100);
+        let mut r = Reassembly::new(4_096);
         insert(&mut r, 1, 10, 2, b"cd");
         insert(&mut r, 1, 10, 6, b"gh");
         let mut now = r.deadline().unwrap();

@@ -13,7 +13,7 @@ use ddx_wire::{Contract, Delivery, Epoch, Seq, StreamId, Tag, Time};
 use super::books::{Books, Failure, Ledger, Standing};
 use super::deadlines::Deadlines;
 use super::early::Early;
-use super::order::{Next, Order, Why, is_later_epoch};
+use super::order::{Next, Order, Why, cost, is_later_epoch};
 use super::reassembly::{Due, Place, Reassembly, Rules};
 use super::reception::Reception;
 use super::{Passed, Received, ReceiverEvent, TimerName, key};
@@ -26,7 +26,7 @@ pub struct ReceiverConfig {
     /// The domain key's public id.
     pub key: KeyId,
     /// Most bytes of incomplete samples, again of whole ones that the driver has not taken, and again of those that wait
-    /// for an earlier one.
+    /// for an earlier one, each with what it takes beside its payload.
     pub budget_bytes: usize,
     /// Most streams expected at a time.
     pub max_streams: usize,
@@ -72,6 +72,13 @@ pub struct ReceiverCounters {
     pub unwanted_records: u64,
     /// Streams not expected because there were too many: their readers get nothing.
     pub refused_streams: u64,
+    /// Requests for what is missing that found no room to wait in: they are made again later. Growth means that very much
+    /// is lost, or that the driver does not collect them.
+    pub dropped_nacks: u64,
+    /// Records about samples that are gone, for which the byte budget had no room: what they tell is asked for again.
+    pub dropped_gone: u64,
+    /// Datagrams of more paths of one sender than are reported. An honest one has not so many.
+    pub unreported_datagrams: u64,
 }
 
 #[derive(Debug, Default)]
@@ -378,7 +385,9 @@ impl Receiver {
         let plaintext: &[u8] = session.open(datagram)?.plaintext;
         let stream = single.then_some(header.stream);
         let (preamble, records) = Records::open(plaintext, stream).ok_or(Refused::Malformed)?;
-        self.reception.note(tag, &preamble, len, now);
+        if !self.reception.note(tag, &preamble, len, now) {
+            self.counters.unreported_datagrams += 1;
+        }
         for record in records {
             let record = record.map_err(|_| Refused::Malformed)?;
             if single && record.stream != header.stream {
@@ -413,13 +422,19 @@ impl Receiver {
         let patience = patience(self.config.own, record, stream.by_group);
         if record.gone {
             if let (Some(order), Some(count)) = (&mut stream.order, record.gone_count()) {
+                if self.ordered_bytes + cost(0) > self.config.budget_bytes {
+                    self.counters.dropped_gone += 1;
+                    return;
+                }
                 let meta = &record.meta;
                 let span = (Seq(meta.seq.0 - count + 1), meta.seq);
                 let why = match meta.filtered {
                     0 => Why::Overwritten,
                     _ => Why::LeftOut,
                 };
+                let before = order.held_bytes();
                 order.gone(meta.epoch, span, why, patience, now);
+                self.ordered_bytes = self.ordered_bytes - before + order.held_bytes();
                 self.settle(tag, id, now);
             }
             return;
@@ -515,14 +530,14 @@ impl Receiver {
         now: Time,
     ) {
         let id = record.stream;
-        if self.ordered_bytes + payload.len() > self.config.budget_bytes {
+        if self.ordered_bytes + cost(payload.len()) > self.config.budget_bytes {
             // Room is made by giving up what is missing before those that are here.
             self.skip_gap(tag, id, now);
         }
         let Some(stream) = self.streams.get_mut(&(tag, id)) else {
             return;
         };
-        if self.ordered_bytes + payload.len() > self.config.budget_bytes {
+        if self.ordered_bytes + cost(payload.len()) > self.config.budget_bytes {
             stream.ledger.fail(meta, Failure::OverBudget);
             return;
         }
@@ -689,6 +704,8 @@ impl Receiver {
     fn push_nack(&mut self, tag: Tag, nack: NackEntry) {
         if self.nacks.len() < NACKS {
             self.nacks.push_back((tag, nack));
+        } else {
+            self.counters.dropped_nacks += 1;
         }
     }
 
@@ -764,7 +781,7 @@ const PATIENCE_UNIT: Duration = Duration::from_micros(700);
 const PARTIALS: usize = 2;
 /// The same where each sample is wanted.
 const PARTIALS_EVERY: usize = 8;
-/// Requests that wait to be sent; what is not asked for now is asked for later.
+/// Requests that wait to be sent, of at most 900 B each: 225 KiB. What is not asked for now is asked for later.
 const NACKS: usize = 256;
 /// Assumed until measured.
 const ROUND_TRIP_UNKNOWN: Duration = Duration::from_millis(50);

@@ -43,12 +43,12 @@ impl Reception {
         }
     }
 
-    /// Notes a datagram. Those of a sender's paths beyond the limit are not reported.
-    pub(super) fn note(&mut self, tag: Tag, preamble: &Preamble, len: usize, now: Time) {
+    /// Notes a datagram. Those of a sender's paths beyond the limit are not reported: then it is false.
+    pub(super) fn note(&mut self, tag: Tag, preamble: &Preamble, len: usize, now: Time) -> bool {
         self.shares.note(tag, len, preamble.is_limited, now);
         let at = (tag, preamble.path);
         if !self.paths.contains_key(&at) && self.of(tag).count() >= PATHS {
-            return;
+            return false;
         }
         let path = self.paths.entry(at).or_insert_with(|| Path {
             report: ReportEntry {
@@ -112,6 +112,7 @@ impl Reception {
             };
             self.due.set_earlier(at, (path.reported + pause).max(now));
         }
+        true
     }
 
     pub(super) fn deadline(&self) -> Option<Time> {
@@ -155,7 +156,7 @@ fn micros(now: Time) -> u32 {
     u32::try_from(micros & u64::from(u32::MAX)).unwrap_or_default()
 }
 
-/// Paths of one sender: its groups, and a unicast one for each address that this host had.
+/// Paths of one sender: its groups, and a unicast one for each address that this host had. One takes 200 B at most.
 const PATHS: usize = 64;
 /// `PROTOCOL.md#reports`: bytes that are worth a report.
 const WORTH_BYTES: usize = 2_048;
@@ -220,6 +221,24 @@ mod tests {
         note(&mut reception, 3, 1_000, 1_200, 1_600);
         let at = reception.deadline().unwrap();
         assert_eq!(reception.report(at).unwrap().1.delay_us, 500);
+    }
+
+    #[test]
+    fn paths_of_one_sender_are_few_and_more_are_said_to_be_too_many() {
+        let mut reception = Reception::new();
+        let mut note = |tag, path| {
+            let preamble = Preamble {
+                path,
+                number: 1,
+                sent_us: 0,
+                is_probe: false,
+                is_limited: false,
+            };
+            reception.note(tag, &preamble, 1_000, Time(1_000))
+        };
+        let reported = (0..1_000).filter(|path| note(TAG, *path)).count();
+        assert_eq!(reported, PATHS);
+        assert!(note(TAG, 3) && note(Tag(2), 1));
     }
 
     #[test]

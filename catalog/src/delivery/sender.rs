@@ -68,6 +68,13 @@ pub struct SenderCounters {
     pub bytes: u64,
     /// Streams not opened because there were too many: their readers get nothing.
     pub refused_streams: u64,
+    /// Readers that were left out of a stream because it has too many, at each change of its route: they get nothing.
+    pub refused_readers: u64,
+    /// Requests for repair that found no room: they are made again. Growth means that a reading host asks for very much.
+    pub dropped_requests: u64,
+    /// Records that found no room in the lane of a path, of samples that are too old to be sent: their readers ask for
+    /// them again, and are told then. Growth means that one writes old samples faster than a link can tell of them.
+    pub dropped_records: u64,
 }
 
 /// What a [`Sender`] has done for one stream.
@@ -131,7 +138,8 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             full: false,
         });
         let before = std::mem::take(&mut stream.destinations);
-        stream.reroute(route, now);
+        let left_out = stream.reroute(route, now);
+        self.counters.refused_readers += left_out;
         let contract = stream.contract;
         let destinations = stream.destinations.clone();
         let wanting: Vec<SocketAddr> = stream
@@ -211,7 +219,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
                 for to in &stream.destinations {
                     // What waits comes before it, and takes its own turn.
                     if let Some(path) = self.paths.get_mut(to).filter(|path| !path.waits(id)) {
+                        let before = path.dropped_records();
                         path.leave_out(id, meta);
+                        self.counters.dropped_records += path.dropped_records() - before;
                         enlist(&mut self.ready, &self.blocked, *to);
                     }
                 }
@@ -286,6 +296,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             return;
         };
         let found = found.as_ref().map(|(meta, payload)| (meta, *payload));
+        let before = path.dropped_records();
         let offered = match found {
             Some((meta, _)) if !admitted => {
                 path.refused(fetch, meta, newest);
@@ -293,6 +304,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             }
             Some(_) | None => path.fetched(fetch, found, newest, now),
         };
+        self.counters.dropped_records += path.dropped_records() - before;
         if path.has_command() {
             self.blocked.clear(fetch.to);
         }
@@ -367,6 +379,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         };
         let path = self.path(to);
         path.open(nack.stream, contract);
+        let before = path.dropped_requests(nack.stream);
         let answered = match &nack.lacks {
             Lacks::Samples(count) => {
                 path.handle_gap(nack.stream, nack.epoch, nack.seq, *count);
@@ -374,6 +387,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             }
             Lacks::Parts(parts) => path.handle_parts(nack.stream, at, parts, is_newest, now),
         };
+        self.counters.dropped_requests += path.dropped_requests(nack.stream) - before;
         self.hungry.insert(to);
         enlist(&mut self.ready, &self.blocked, to);
         if answered

@@ -42,7 +42,8 @@ pub(super) struct Reader {
 }
 
 impl Stream {
-    pub(super) fn reroute(&mut self, route: &Route, now: Time) {
+    /// Follows a route. How many of its readers are beyond the limit, and left out.
+    pub(super) fn reroute(&mut self, route: &Route, now: Time) -> u64 {
         self.contract = route.contract;
         self.next_due = self.next_due.min(now + self.interval());
         let mut old = std::mem::take(&mut self.readers);
@@ -60,6 +61,7 @@ impl Stream {
             .flat_map(|reader| reader.host.destinations())
             .collect();
         self.destinations = destinations.into_iter().collect();
+        u64::try_from(route.readers.len().saturating_sub(MAX_READERS)).unwrap_or(u64::MAX)
     }
 
     /// Tells whether a sample fits the protocol and the contract, and counts one that does not.

@@ -8,6 +8,7 @@ use proptest::prelude::*;
 
 use super::*;
 
+mod bounds;
 mod every;
 mod link;
 

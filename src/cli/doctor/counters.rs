@@ -41,12 +41,28 @@ fn meaning(what: &str, domain: u16) -> Option<(&'static str, String)> {
             "streams of other hosts that were not taken in, because there are too many",
             "catalog/PROTOCOL.md has the limit; `ddx ls` shows what is read here",
         ),
+        "unsent_streams" => (
+            "streams to other hosts that were not opened, because there are too many: their readers get nothing",
+            "catalog/PROTOCOL.md has the limit; `ddx stat` shows what is sent",
+        ),
+        "unsent_readers" => (
+            "reading hosts that a stream left out, because it has too many: they get nothing",
+            "catalog/PROTOCOL.md has the limit; `ddx stat` shows the streams",
+        ),
+        "dropped_nacks" | "dropped_requests" => (
+            "requests for lost samples that found no room and were made again later: very much is lost",
+            "`ddx stat` shows which link loses; `ddx host ls` its loss",
+        ),
+        "dropped_gone" | "dropped_records" => (
+            "news of samples that a reader will not get that found no room and are told again later",
+            "`ddx stat` shows where samples are overwritten or too old; a lower rate or a deeper ring relieves the link",
+        ),
         "stale_lives" => (
             "greetings of an earlier life of a host",
             "two machines with a copied disk share one identity: remove /var/lib/ddx on one of them and restart it",
         ),
         "over_limit" => (
-            "messages dropped because a limit was reached: hosts, handshakes, leases or the queue to send",
+            "what was dropped because a limit was reached: hosts, handshakes, items, subscriptions, leases or the queue to send",
             "`ddx host ls` and `ddx ls` show how many there are; catalog/PROTOCOL.md has the limits",
         ),
         "membership_refused" => (
@@ -54,7 +70,7 @@ fn meaning(what: &str, domain: u16) -> Option<(&'static str, String)> {
             "all hosts should run one version: `ddx --version`",
         ),
         "directory_full" => (
-            "items of other hosts that had no room",
+            "items of other hosts, or parts of their schemas, that had no room",
             "`ddx ls` shows who has so many items",
         ),
         "refused_other_protocol_version" => (

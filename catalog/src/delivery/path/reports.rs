@@ -1,11 +1,13 @@
-//! What a path learns from how its datagrams arrive.
+//! What a path learns from how its datagrams arrive, and what it had no room for.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
 
 use ddx_wire::message::ReportEntry;
-use ddx_wire::{Tag, Time};
+use ddx_wire::{StreamId, Tag, Time};
 
+use super::super::flow::Flow;
+use super::super::queue::Queue;
 use super::super::reporter::Reporter;
 use super::super::sender::FIRST_UNICAST;
 use super::super::transfer::Flight;
@@ -88,6 +90,16 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         let others = self.reporters.iter().filter(|(tag, _)| **tag != one);
         let mut others = others.filter_map(|(_, reporter)| reporter.strain(now));
         strain.is_some_and(|strain| others.any(|other| strain.is_not_shared_by(&other)))
+    }
+
+    /// Records that found no room in their lane.
+    pub(in crate::delivery) fn dropped_records(&self) -> u64 {
+        self.lanes.iter().map(Queue::dropped).sum()
+    }
+
+    /// Requests for repair of a stream that found no room.
+    pub(in crate::delivery) fn dropped_requests(&self, stream: StreamId) -> u64 {
+        self.flows.get(&stream).map_or(0, Flow::dropped_gaps)
     }
 
     /// Forgets the reports of readers that are gone.
