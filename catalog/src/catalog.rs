@@ -32,7 +32,7 @@ mod handle;
 
 /// A host of which something came so recently is not probed by membership: a little more than the pause between two digests.
 const SIGN_OF_LIFE: Duration = Duration::from_millis(1_100);
-/// Membership datagrams that wait for a session with their destination.
+/// Membership datagrams that wait for a session with their destination, of at most 1,100 B each: 275 KiB.
 const WAITING_MAX: usize = 256;
 
 /// The control plane of one host.
@@ -281,7 +281,8 @@ impl Catalog {
         now: Time,
     ) -> Result<(), Error> {
         self.now = now;
-        self.directory.announce(description, schema_text, now)
+        let announced = self.directory.announce(description, schema_text, now);
+        self.count_refused(announced)
     }
 
     /// Removes an item of this host from the directory. Its streams end.
@@ -305,8 +306,10 @@ impl Catalog {
     ) -> Result<(), Error> {
         self.now = now;
         let owner = self.owner(&name);
-        self.interest
-            .subscribe(name, contract, owner, now, &mut self.out)
+        let subscribed = self
+            .interest
+            .subscribe(name, contract, owner, now, &mut self.out);
+        self.count_refused(subscribed)
     }
 
     /// Ends a subscription.
@@ -441,6 +444,11 @@ impl Catalog {
             .collect()
     }
 
+    /// The name of a host, while that is known.
+    pub fn host_name(&self, host: HostId) -> Option<&HostName> {
+        self.hosts.get(host).map(|host| &host.name)
+    }
+
     /// Items of other hosts whose names fit.
     pub fn items(&self, pattern: &Pattern) -> Vec<RemoteItem> {
         self.directory.items(pattern).collect()
@@ -463,11 +471,26 @@ impl Catalog {
 
     /// What was counted since the start.
     pub fn counters(&self) -> Counters {
+        let dropped = [
+            self.out.dropped,
+            self.membership.dropped(),
+            self.hosts.dropped,
+            self.sessions.paths.dropped,
+            self.directory.unanswered(),
+            self.interest.dropped(),
+        ];
         Counters {
-            over_limit: self.counters.over_limit.saturating_add(self.out.dropped),
-            directory_full: self.directory.dropped,
+            over_limit: dropped
+                .into_iter()
+                .fold(self.counters.over_limit, u64::saturating_add),
+            directory_full: self.directory.dropped(),
             ..self.counters
         }
+    }
+
+    fn count_refused(&mut self, done: Result<(), Error>) -> Result<(), Error> {
+        self.counters.over_limit += u64::from(done.is_err());
+        done
     }
 
     /// Passes on what one part left for another.
@@ -490,14 +513,17 @@ impl Catalog {
             }
             let addr = to.contact.map(|(_, addr)| addr);
             let addr = addr.or_else(|| self.hosts.get(to.host).map(|host| host.addr));
-            if let Some(addr) = addr
-                && self
-                    .sessions
-                    .challenge(tag, addr, now, &mut self.rng, &mut self.out)
-            {
-                if self.waiting.len() >= WAITING_MAX {
+            let Some(addr) = addr else {
+                continue;
+            };
+            let asked = self
+                .sessions
+                .challenge(tag, addr, now, &mut self.rng, &mut self.out);
+            let is_full = self.waiting.len() >= WAITING_MAX;
+            self.counters.over_limit += u64::from(is_full || !asked);
+            if asked {
+                if is_full {
                     self.waiting.pop_front();
-                    self.counters.over_limit = self.counters.over_limit.saturating_add(1);
                 }
                 self.waiting.push_back((tag, bytes));
             }

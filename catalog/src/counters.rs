@@ -22,10 +22,11 @@ pub struct Counters {
     pub stale_responses: u64,
     /// Greetings of earlier lives of known hosts.
     pub stale_lives: u64,
-    /// Messages that were dropped because a limit was reached: hosts, handshakes, items, leases or the send queue.
+    /// What was dropped because a limit was reached: hosts, handshakes, items and subscriptions of this host, leases, probes,
+    /// orders, goodbyes, or what waits to be sent or told.
     pub over_limit: u64,
     /// Datagrams of the membership protocol that it refused.
     pub membership_refused: u64,
-    /// Items of other hosts that were dropped because the directory is full.
+    /// Items of other hosts, and parts of their schemas, that were dropped because the directory is full.
     pub directory_full: u64,
 }

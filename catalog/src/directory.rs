@@ -41,8 +41,11 @@ const PULL_STEADY: u32 = 6;
 const PULL_RETRY_MAX: Duration = Duration::from_millis(400);
 /// Ranges beyond a gap that are remembered, and gaps that are asked for at one time.
 const RANGES_MAX: usize = 32;
-/// Items of all other hosts.
-const REMOTE_ITEMS_MAX: usize = 1 << 20;
+/// What the items of all other hosts take, as [`cost`] has it: some 400,000 of usual names. The daemon and its store hold
+/// each description once more.
+const REMOTE_BYTES_MAX: usize = 256 << 20;
+/// What one item takes beside its name and its program.
+const ITEM_BYTES: usize = 512;
 
 pub(crate) struct Directory {
     own: Own,
@@ -54,9 +57,8 @@ pub(crate) struct Directory {
     push: Option<(u64, Time)>,
     reminders: Vec<Time>,
     next_digest: Option<Time>,
-    remote_items: usize,
-    /// Items dropped because the directory is full.
-    pub(crate) dropped: u64,
+    remote_bytes: usize,
+    dropped: u64,
 }
 
 struct Remote {
@@ -78,6 +80,7 @@ struct Item {
     version: u64,
     description: Option<ItemDescription>,
     shown: Option<ItemName>,
+    bytes: usize,
 }
 
 struct Pull {
@@ -109,7 +112,7 @@ impl Directory {
             push: None,
             reminders: Vec::new(),
             next_digest: None,
-            remote_items: 0,
+            remote_bytes: 0,
             dropped: 0,
         }
     }
@@ -149,6 +152,16 @@ impl Directory {
         let (host, name) = self.shown.get(shown)?;
         let item = self.remotes.get(host)?.items.get(name)?;
         Some((*host, item.description.as_ref()?))
+    }
+
+    /// Items of other hosts, and parts of their schemas, for which there was no room.
+    pub(crate) fn dropped(&self) -> u64 {
+        self.dropped.saturating_add(self.schemas.dropped)
+    }
+
+    /// Orders of other hosts that found no room: they are given again.
+    pub(crate) fn unanswered(&self) -> u64 {
+        self.own.dropped
     }
 
     /// A name whose item appeared, changed, moved or went since it was last asked.
@@ -215,7 +228,7 @@ impl Directory {
             return;
         };
         self.own.cancel(remote.tag);
-        self.remote_items -= remote.items.len();
+        self.remote_bytes -= remote.items.values().map(|i| i.bytes).sum::<usize>();
         for item in remote.items.into_values() {
             hide(&mut self.shown, &mut self.changed, host, item.shown, out);
         }
@@ -371,21 +384,22 @@ impl Directory {
             if known.is_some_and(|item| item.life == tag && item.version >= change.version) {
                 continue;
             }
-            if known.is_none()
-                && (remote.items.len() >= ITEMS_MAX || self.remote_items >= REMOTE_ITEMS_MAX)
-            {
+            let bytes = cost(&name, description.as_ref());
+            let before = known.map_or(0, |item| item.bytes);
+            let is_full = remote.items.len() >= ITEMS_MAX
+                || self.remote_bytes - before + bytes > REMOTE_BYTES_MAX;
+            if known.is_none() && is_full {
                 self.dropped = self.dropped.saturating_add(1);
                 continue;
             }
-            if known.is_none() {
-                self.remote_items += 1;
-            }
+            self.remote_bytes = self.remote_bytes - before + bytes;
             let shown = known.and_then(|item| item.shown.clone());
             let item = Item {
                 life: tag,
                 version: change.version,
                 description,
                 shown,
+                bytes,
             };
             remote.items.insert(name.clone(), item);
             names.push(name);
@@ -510,11 +524,11 @@ impl Directory {
             return;
         }
         remote.renewed = false;
-        let before = remote.items.len();
         let tag = remote.tag;
         remote.items.retain(|_, item| {
             let stays = item.life == tag;
             if !stays {
+                self.remote_bytes -= item.bytes;
                 hide(
                     &mut self.shown,
                     &mut self.changed,
@@ -525,7 +539,6 @@ impl Directory {
             }
             stays
         });
-        self.remote_items -= before - remote.items.len();
     }
 
     /// Shows what is known of a host, or only the items with one schema, whose text just arrived.
@@ -657,6 +670,12 @@ impl Remote {
         rest.truncate(RANGES_MAX);
         self.beyond = rest;
     }
+}
+
+/// What an item takes: its name is held in four tables.
+fn cost(name: &ItemName, description: Option<&ItemDescription>) -> usize {
+    let program = description.map_or(0, |description| description.program.len());
+    ITEM_BYTES + 4 * name.as_str().len() + program
 }
 
 fn hide(

@@ -35,6 +35,14 @@ pub enum Error {
         /// The limit.
         limit: usize,
     },
+    /// The schema texts of this host's items take as many bytes as they may.
+    #[error("schemas of this host are full: {limit} bytes; `{name}` was not announced")]
+    SchemasFull {
+        /// The item.
+        name: ItemName,
+        /// The limit, bytes.
+        limit: usize,
+    },
     /// This host subscribes to as many items as it may.
     #[error("{limit} items are subscribed already; `{name}` was not")]
     TooManySubscriptions {

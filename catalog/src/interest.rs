@@ -11,9 +11,12 @@ use std::time::Duration;
 use ddx_wire::message::{AckEntry, GrantEntry, Message, Reception, RenewEntry, SubscribeEntry};
 use ddx_wire::{Contract, Epoch, ItemDescription, ItemName, Seq, StreamId, Tag, Time};
 
+use self::farewells::Farewells;
 use crate::error::Error;
 use crate::event::Event;
 use crate::outbox::Outbox;
+
+mod farewells;
 
 const RENEW_PERIOD: Duration = Duration::from_secs(1);
 /// What is unanswered is said again after this, twice this, and so on up to eight times this.
@@ -28,13 +31,12 @@ const ACK_AFTER: Duration = Duration::from_millis(20);
 const CONFIRM_AFTER: Duration = Duration::from_millis(5);
 /// A group is silent when samples arrive for so long, and none by it.
 const SILENT_AFTER: Duration = Duration::from_millis(500);
-/// When a goodbye is said again, in case it was lost.
-const FAREWELLS: [Duration; 2] = [Duration::from_millis(50), Duration::from_millis(200)];
 /// Entries of one renewal, ack or goodbye: they take at most 27 bytes each.
 const ENTRIES_MAX: usize = 40;
 /// Bytes of names in one request, which leave room for the rest of its entries.
 const ASK_BYTES: usize = 1_000;
 const ASK_ENTRY_BYTES: usize = 36;
+/// Items that this host wants. One takes 1,500 B at most, of which its name is the most: 24 MiB.
 const SUBSCRIPTIONS_MAX: usize = 16_384;
 
 #[derive(Default)]
@@ -44,7 +46,7 @@ pub(crate) struct Interest {
     streams: BTreeMap<(Tag, StreamId), ItemName>,
     links: BTreeMap<Tag, Link>,
     groups: BTreeMap<SocketAddr, usize>,
-    farewells: Vec<Farewell>,
+    farewells: Farewells,
     last_number: u32,
 }
 
@@ -86,12 +88,6 @@ struct Link {
     unanswered: u32,
     acks: BTreeSet<StreamId>,
     next_ack: Option<Time>,
-}
-
-struct Farewell {
-    at: Time,
-    to: Tag,
-    number: u32,
 }
 
 /// A stream that this host receives, for listings.
@@ -163,12 +159,7 @@ impl Interest {
         self.name_of.remove(&want.number);
         if let Some(owner) = want.phase.owner() {
             out.send(owner, &Message::Unsubscribe(vec![want.number]));
-            let again = FAREWELLS.iter().map(|after| Farewell {
-                at: now + *after,
-                to: owner,
-                number: want.number,
-            });
-            self.farewells.extend(again);
+            self.farewells.repeat(owner, want.number, now);
         }
         self.release(&want.phase, out);
         true
@@ -414,7 +405,7 @@ impl Interest {
     /// Forgets a life that ended: what it sent waits for another owner.
     pub(crate) fn drop_owner(&mut self, owner: Tag, out: &mut Outbox) {
         self.links.remove(&owner);
-        self.farewells.retain(|farewell| farewell.to != owner);
+        self.farewells.drop_owner(owner);
         let mut released = Vec::new();
         for want in self.wants.values_mut() {
             if want.phase.owner() == Some(owner) {
@@ -424,6 +415,11 @@ impl Interest {
         for phase in released {
             self.release(&phase, out);
         }
+    }
+
+    /// Goodbyes that are not said again, because too many wait for that.
+    pub(crate) fn dropped(&self) -> u64 {
+        self.farewells.dropped
     }
 
     /// Whether this host reads something of that life.
@@ -477,14 +473,12 @@ impl Interest {
             link.next_ack
                 .map_or(link.next_renewal, |ack| ack.min(link.next_renewal))
         });
-        asks.chain(links)
-            .chain(self.farewells.iter().map(|f| f.at))
-            .min()
+        asks.chain(links).chain(self.farewells.poll_timeout()).min()
     }
 
     /// Sends what is due; the owners that were sent a renewal.
     pub(crate) fn handle_timeout(&mut self, now: Time, out: &mut Outbox) -> Vec<Tag> {
-        self.say_farewells(now, out);
+        self.farewells.handle_timeout(now, out);
         self.ask(now, out);
         let mut renewed = Vec::new();
         for (owner, link) in &mut self.links {
@@ -600,21 +594,6 @@ impl Interest {
         }
     }
 
-    fn say_farewells(&mut self, now: Time, out: &mut Outbox) {
-        let mut due: BTreeMap<Tag, Vec<u32>> = BTreeMap::new();
-        self.farewells.retain(|farewell| {
-            if farewell.at <= now {
-                due.entry(farewell.to).or_default().push(farewell.number);
-            }
-            farewell.at > now
-        });
-        for (to, numbers) in due {
-            for numbers in numbers.chunks(ENTRIES_MAX) {
-                out.send(to, &Message::Unsubscribe(numbers.to_vec()));
-            }
-        }
-    }
-
     fn link(&mut self, owner: Tag, now: Time) -> &mut Link {
         self.links.entry(owner).or_insert_with(|| Link {
             next_renewal: now + RENEW_PERIOD,
@@ -706,6 +685,7 @@ fn retry_after(tries: u32) -> Duration {
 mod tests {
     use ddx_wire::{HostName, SchemaHash, WriterState};
 
+    use super::farewells::FAREWELLS;
     use super::*;
 
     const OWNER: Tag = Tag(7);

@@ -40,6 +40,8 @@ const NOISE: Duration = Duration::from_millis(1);
 /// Whole of a loss; it is averaged over some sixteen probes.
 const LOSS_WHOLE: u32 = 1_024;
 const LOSS_WEIGHT: u32 = 16;
+/// Probes whose time is not up, of 150 B each with their place in two tables: 2.4 MiB. As many as there are paths.
+const PROBES_MAX: usize = 16_384;
 /// Hosts that are probed in one go when this host's own addresses change.
 const REFRESH_MAX: usize = 256;
 
@@ -70,6 +72,8 @@ pub(crate) struct Paths {
     /// The idle host that was probed last: they take turns.
     turn: Option<Tag>,
     moved: VecDeque<Tag>,
+    /// Probes that were not sent because so many wait for their answers.
+    pub(crate) dropped: u64,
 }
 
 struct Peer {
@@ -335,6 +339,10 @@ impl Paths {
         peer.probed = now;
         for path in peer.paths.iter_mut().filter(|path| which(path)) {
             if path.asked.is_some() {
+                continue;
+            }
+            if self.deadlines.len() >= PROBES_MAX {
+                self.dropped = self.dropped.saturating_add(1);
                 continue;
             }
             self.last_nonce += 1;
@@ -703,6 +711,22 @@ mod tests {
         }
         assert_eq!(rig.addrs().len(), CONTROL_ADDRS_MAX);
         assert!(rig.addrs().contains(&rig.used()));
+    }
+
+    #[test]
+    fn a_host_that_speaks_from_ever_more_addresses_is_probed_up_to_a_limit() {
+        let mut rig = Rig::new(&[addr(1)], &[]);
+        let flood = u16::try_from(PROBES_MAX + 1_000).unwrap();
+        for port in 0..flood {
+            let from = SocketAddr::from(([10, 0, 0, 9], 100 + port));
+            rig.paths.heard(TAG, from, rig.now, &mut rig.out);
+        }
+        assert_eq!(rig.paths.deadlines.len(), PROBES_MAX);
+        assert!(rig.paths.dropped >= 1_000, "{}", rig.paths.dropped);
+        // They make room when their time is up.
+        let later = rig.now + PATIENCE_MOST;
+        rig.paths.handle_timeout(later, |_| false, &mut rig.out);
+        assert!(rig.paths.deadlines.len() < 10);
     }
 
     #[test]

@@ -41,8 +41,10 @@ const NEWS_AGAIN: [Duration; 3] = [
 ];
 const CHALLENGE_RETRY: Duration = Duration::from_millis(100);
 const CHALLENGE_TRIES: u32 = 10;
+/// Handshakes under way, of 100 B each: 25 KiB.
 const PENDING_MAX: usize = 256;
-/// Lives of hosts with which this host can hold sessions at one time.
+/// Lives of hosts with which this host can hold sessions at one time. One takes 3 KiB at most, with its paths and the
+/// replay window of each lane: 12 MiB, and as much again on the receiving thread.
 const SESSIONS_MAX: usize = 4_096;
 /// Up to this many sessions each stranger's beacon is answered; beyond, a share of them, and the rest is met on demand.
 const EAGER_SESSIONS: usize = 32;

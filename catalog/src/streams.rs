@@ -4,7 +4,7 @@
 //! group; each is sent both until it confirms that samples arrive there, and then the group alone. Whoever does not
 //! confirm although samples flow, or loses more by the group than by unicast, is served by unicast for a while.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -27,6 +27,7 @@ const TICK: Duration = Duration::from_millis(250);
 const TRIAL_PAUSE: Duration = Duration::from_secs(30);
 /// The same after a reader moved: long enough for its host to join where it is now.
 const MOVED_PAUSE: Duration = Duration::from_secs(1);
+/// Leases of all hosts. One takes 1,200 B at most with a stream of its own, of which the item's name is the most: 75 MiB.
 const LEASES_MAX: usize = 65_536;
 const LEASES_PER_HOST_MAX: usize = 16_384;
 /// Entries of one grant: they take at most 34 bytes each, with an IPv6 group.
@@ -188,7 +189,7 @@ impl Streams {
                 self.leases.remove(&(from, before));
             }
             self.route(id, now, out);
-            out.event(Event::Held {
+            out.offer(Event::Held {
                 stream: id,
                 tag: from,
                 epoch: held.0,
@@ -223,7 +224,9 @@ impl Streams {
                 lease.closed = true;
                 lease.expires = now + LEASE;
                 let stream = lease.stream;
-                self.leave(stream, from, *want, now, out);
+                if self.leave(stream, from, *want, out) {
+                    self.route(stream, now, out);
+                }
             }
         }
     }
@@ -269,7 +272,7 @@ impl Streams {
                 });
             }
             let (epoch, seq) = (entry.epoch, entry.seq);
-            out.event(Event::Held {
+            out.offer(Event::Held {
                 stream,
                 tag: from,
                 epoch,
@@ -292,7 +295,7 @@ impl Streams {
             if stream.is_none_or(|stream| !stream.readers.contains_key(&from)) {
                 continue;
             }
-            out.event(Event::Held {
+            out.offer(Event::Held {
                 stream: entry.stream,
                 tag: from,
                 epoch: entry.epoch,
@@ -352,10 +355,12 @@ impl Streams {
         let leases: Vec<_> = leases
             .map(|((_, want), lease)| (*want, lease.stream))
             .collect();
-        for (want, stream) in leases {
-            self.leases.remove(&(reader, want));
-            self.leave(stream, reader, want, now, out);
-        }
+        let leases = leases.into_iter();
+        self.end(
+            leases.map(|(want, stream)| ((reader, want), stream)),
+            now,
+            out,
+        );
     }
 
     /// Ends the streams of an item that was withdrawn.
@@ -408,10 +413,7 @@ impl Streams {
         }
         let lapsed = self.leases.iter().filter(|(_, lease)| lease.expires <= now);
         let lapsed: Vec<_> = lapsed.map(|(key, lease)| (*key, lease.stream)).collect();
-        for ((reader, want), stream) in lapsed {
-            self.leases.remove(&(reader, want));
-            self.leave(stream, reader, want, now, out);
-        }
+        self.end(lapsed.into_iter(), now, out);
         let tried: Vec<_> = self
             .streams
             .iter()
@@ -448,23 +450,43 @@ impl Streams {
         id
     }
 
-    /// Removes a reader from a stream, and the stream with its last reader.
-    fn leave(&mut self, id: StreamId, reader: Tag, want: u32, now: Time, out: &mut Outbox) {
+    /// Ends leases. Each stream that goes on gets one new route, however many of its readers left at once.
+    fn end(
+        &mut self,
+        leases: impl Iterator<Item = ((Tag, u32), StreamId)>,
+        now: Time,
+        out: &mut Outbox,
+    ) {
+        let mut left = BTreeSet::new();
+        for ((reader, want), stream) in leases {
+            self.leases.remove(&(reader, want));
+            if self.leave(stream, reader, want, out) {
+                left.insert(stream);
+            }
+        }
+        for stream in left {
+            // It may have ended since with its last reader.
+            self.route(stream, now, out);
+        }
+    }
+
+    /// Removes a reader from a stream, and the stream with its last reader. Whether it goes on without that reader.
+    fn leave(&mut self, id: StreamId, reader: Tag, want: u32, out: &mut Outbox) -> bool {
         let Some(stream) = self.streams.get_mut(&id) else {
-            return;
+            return false;
         };
         if stream.readers.get(&reader) != Some(&want) {
-            return;
+            return false;
         }
         stream.readers.remove(&reader);
-        if stream.readers.is_empty() {
-            if let Some(stream) = self.streams.remove(&id) {
-                self.by_item.remove(&(stream.name, stream.contract));
-            }
-            out.event(Event::CloseStream { stream: id });
-        } else {
-            self.route(id, now, out);
+        if !stream.readers.is_empty() {
+            return true;
         }
+        if let Some(stream) = self.streams.remove(&id) {
+            self.by_item.remove(&(stream.name, stream.contract));
+        }
+        out.event(Event::CloseStream { stream: id });
+        false
     }
 
     /// Settles the path of a stream, tells the sender, and offers the group to those who do not know of it.

@@ -82,7 +82,6 @@ impl Catalog {
         let tag = Tag::of(from.host, from.incarnation);
         let Some(arrival) = self.hosts.arrived(from, addr, now, &mut self.out) else {
             self.sessions.close(tag);
-            self.counters.over_limit += 1;
             return;
         };
         if let Some(ended) = arrival.ended {
@@ -221,12 +220,12 @@ impl Catalog {
             Message::Report(reports) => {
                 self.streams.handle_report(tag, &reports, now, out);
                 for report in reports {
-                    out.event(Event::Report { tag, report });
+                    out.offer(Event::Report { tag, report });
                 }
             }
             Message::Nack(nacks) => {
                 for nack in nacks {
-                    out.event(Event::Nack { tag, nack });
+                    out.offer(Event::Nack { tag, nack });
                 }
             }
             Message::Probe { nonce } => out.send_by(tag, from, &Message::Probed { nonce }),

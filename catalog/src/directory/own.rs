@@ -22,6 +22,10 @@ const DELTA_HEAD_BYTES: usize = 40;
 const SERVE_PERIOD: Duration = Duration::from_millis(4);
 const SERVE_BATCH: usize = 8;
 const RANGES_MAX: usize = 32;
+/// Schema texts that one host may be owed at a time: it asks for eight. With the ranges that makes 4 KiB for each host.
+const ORDERED_SCHEMAS_MAX: usize = 64;
+/// Bytes of the schema texts of this host's items.
+const SCHEMAS_BYTES_MAX: usize = 64 << 20;
 
 /// What this host announces.
 #[derive(Default)]
@@ -29,7 +33,10 @@ pub(super) struct Own {
     version: u64,
     items: BTreeMap<ItemName, Announced>,
     by_version: BTreeMap<u64, ItemName>,
-    schemas: BTreeMap<SchemaHash, Arc<str>>,
+    schemas: BTreeMap<SchemaHash, Schema>,
+    schemas_bytes: usize,
+    /// What others asked for and cannot be owed now.
+    pub(super) dropped: u64,
     orders: BTreeMap<Tag, Order>,
     next_serve: Option<Time>,
     /// The host that was served last: they take turns.
@@ -40,6 +47,12 @@ struct Announced {
     version: u64,
     description: Option<ItemDescription>,
     bytes: usize,
+}
+
+struct Schema {
+    text: Arc<str>,
+    /// How many items have it.
+    items: usize,
 }
 
 /// What one host is owed.
@@ -91,9 +104,16 @@ impl Own {
         if bytes > limit {
             return Err(Error::DescriptionTooLong { name, bytes, limit });
         }
-        self.schemas
-            .entry(description.schema_hash)
-            .or_insert_with(|| Arc::from(schema_text));
+        let hash = description.schema_hash;
+        if !self.schemas.contains_key(&hash) {
+            if self.schemas_bytes + schema_text.len() > SCHEMAS_BYTES_MAX {
+                let limit = SCHEMAS_BYTES_MAX;
+                return Err(Error::SchemasFull { name, limit });
+            }
+            self.schemas_bytes += schema_text.len();
+            let text = Arc::from(schema_text);
+            self.schemas.insert(hash, Schema { text, items: 0 });
+        }
         self.record(name, Some(description), bytes);
         Ok(true)
     }
@@ -115,26 +135,33 @@ impl Own {
         }
         for range in ranges {
             let to = range.to.min(self.version);
-            if range.from < to && order.ranges.len() < RANGES_MAX {
-                order.ranges.push(Range {
-                    from: range.from,
-                    to,
-                });
+            if range.from >= to {
+                continue;
             }
+            if order.ranges.len() >= RANGES_MAX {
+                self.dropped = self.dropped.saturating_add(1);
+                continue;
+            }
+            order.ranges.push(Range {
+                from: range.from,
+                to,
+            });
         }
         self.next_serve.get_or_insert(now);
     }
 
     /// Takes an order for parts of a schema text.
     pub(super) fn order_schema(&mut self, to: Tag, hash: SchemaHash, missing: u64, now: Time) {
-        if self.schemas.contains_key(&hash) {
-            self.orders
-                .entry(to)
-                .or_default()
-                .schemas
-                .insert(hash, missing);
-            self.next_serve.get_or_insert(now);
+        if !self.schemas.contains_key(&hash) {
+            return;
         }
+        let ordered = &mut self.orders.entry(to).or_default().schemas;
+        if ordered.len() < ORDERED_SCHEMAS_MAX || ordered.contains_key(&hash) {
+            ordered.insert(hash, missing);
+        } else {
+            self.dropped = self.dropped.saturating_add(1);
+        }
+        self.next_serve.get_or_insert(now);
     }
 
     pub(super) fn cancel(&mut self, to: Tag) {
@@ -186,7 +213,7 @@ impl Own {
             let part = self
                 .schemas
                 .get(&hash)
-                .and_then(|text| part(hash, text, index));
+                .and_then(|schema| part(hash, &schema.text, index));
             let Some(part) = part else {
                 wanted.remove();
                 continue;
@@ -200,6 +227,11 @@ impl Own {
     fn record(&mut self, name: ItemName, description: Option<ItemDescription>, bytes: usize) {
         self.version += 1;
         let version = self.version;
+        if let Some(used) = &description
+            && let Some(schema) = self.schemas.get_mut(&used.schema_hash)
+        {
+            schema.items += 1;
+        }
         let announced = Announced {
             version,
             description,
@@ -207,8 +239,25 @@ impl Own {
         };
         if let Some(before) = self.items.insert(name.clone(), announced) {
             self.by_version.remove(&before.version);
+            if let Some(description) = before.description {
+                self.release_schema(description.schema_hash);
+            }
         }
         self.by_version.insert(version, name);
+    }
+}
+
+impl Own {
+    /// An item has a schema no longer: the last one takes the text with it.
+    fn release_schema(&mut self, hash: SchemaHash) {
+        let Some(schema) = self.schemas.get_mut(&hash) else {
+            return;
+        };
+        schema.items = schema.items.saturating_sub(1);
+        if schema.items == 0 {
+            self.schemas_bytes -= schema.text.len();
+            self.schemas.remove(&hash);
+        }
     }
 }
 

@@ -9,6 +9,8 @@ use ddx_wire::{SchemaHash, Tag, Time};
 
 use crate::outbox::Outbox;
 
+/// Bytes of texts and parts that are kept: one text has 64 KiB at most, and a usual one 1 KiB.
+const BYTES_MAX: usize = 32 << 20;
 /// Schema texts that are kept; more than any domain of programs has, fewer than would hurt.
 const TEXTS_MAX: usize = 4_096;
 const FETCHES_MAX: usize = 4_096;
@@ -24,6 +26,9 @@ const RETRY_MAX: Duration = Duration::from_millis(600);
 pub(super) struct Schemas {
     texts: BTreeMap<SchemaHash, Arc<str>>,
     fetches: BTreeMap<SchemaHash, Fetch>,
+    held_bytes: usize,
+    /// Parts for which there was no room.
+    pub(super) dropped: u64,
 }
 
 struct Fetch {
@@ -85,6 +90,13 @@ impl Schemas {
         if !fits {
             return false;
         }
+        let before = fetch.parts.get(&part.index).map_or(0, Vec::len);
+        let held_bytes = self.held_bytes - before + part.bytes.len();
+        if held_bytes > BYTES_MAX {
+            self.dropped = self.dropped.saturating_add(1);
+            return false;
+        }
+        self.held_bytes = held_bytes;
         fetch.count = Some(part.count);
         fetch.parts.insert(part.index, part.bytes);
         fetch.next = now + RETRY;
@@ -92,8 +104,10 @@ impl Schemas {
             return false;
         }
         let bytes: Vec<u8> = fetch.parts.values().flatten().copied().collect();
+        let len = bytes.len();
         let Ok(text) = String::from_utf8(bytes) else {
             // Parts of two texts, or a lie: begin anew.
+            self.held_bytes -= len;
             fetch.parts.clear();
             fetch.count = None;
             return false;
@@ -188,6 +202,25 @@ mod tests {
     }
 
     #[test]
+    fn texts_are_kept_up_to_a_limit_and_more_is_counted() {
+        let mut schemas = Schemas::default();
+        let mut texts = 0;
+        for number in 0..1_000_u16 {
+            let mut hash = [0; 16];
+            hash[..2].copy_from_slice(&number.to_le_bytes());
+            let hash = SchemaHash(hash);
+            assert!(schemas.want(hash, Tag(1), Time(0)));
+            for index in 0..64 {
+                let part = part(index, 64, vec![b'a'; SCHEMA_PART_BYTES]);
+                texts += usize::from(schemas.handle_part(SchemaPart { hash, ..part }, Time(1)));
+            }
+        }
+        assert_eq!(texts, BYTES_MAX >> 16);
+        assert_eq!(schemas.dropped, (1_000 - 512) * 64);
+        assert_eq!(schemas.held_bytes, BYTES_MAX);
+    }
+
+    #[test]
     fn lying_parts_are_dropped() {
         let mut schemas = Schemas::default();
         schemas.want(HASH, Tag(1), Time(0));
@@ -199,5 +232,6 @@ mod tests {
             "not UTF-8"
         );
         assert!(schemas.handle_part(part(0, 1, b"ok".to_vec()), Time(1)));
+        assert_eq!(schemas.held_bytes, 2);
     }
 }

@@ -128,5 +128,95 @@ fn a_full_directory_refuses_own_items_by_name_and_counts_those_of_others() {
         "directory is full: 65536 items; `r/more` was not announced"
     );
     assert_eq!(directory.remotes[&OWNER].items.len(), ITEMS_MAX);
-    assert_eq!(directory.dropped, 1);
+    assert_eq!(directory.dropped(), 1);
+}
+
+#[test]
+fn what_the_items_of_others_take_is_counted_and_given_back() {
+    let out = &mut Outbox::default();
+    let mut directory = following(out);
+    let changes = [(1, "a"), (2, "b"), (3, "c")];
+    directory.handle_delta(OWNER, LIFE, delta(0, &changes, 3), Time(1), out);
+    let three = directory.remote_bytes;
+    assert_eq!(three, 3 * (ITEM_BYTES + 4 * 3 + 1));
+    let withdrawn = Delta {
+        range: Range { from: 3, to: 4 },
+        version: 4,
+        changes: vec![Change {
+            version: 4,
+            item: ItemState::Withdrawn(description("b").name),
+        }],
+    };
+    directory.handle_delta(OWNER, LIFE, withdrawn, Time(2), out);
+    assert_eq!(
+        directory.remote_bytes,
+        three - 1,
+        "a tombstone has no program"
+    );
+
+    // A flood fills it, and what has no room is counted.
+    directory.remote_bytes += REMOTE_BYTES_MAX - three - ITEM_BYTES;
+    let flood = delta(4, &[(5, "d"), (6, "e")], 6);
+    directory.handle_delta(OWNER, LIFE, flood, Time(3), out);
+    assert_eq!(
+        (directory.dropped(), directory.remotes[&OWNER].items.len()),
+        (2, 3)
+    );
+    directory.remote_bytes -= REMOTE_BYTES_MAX - three - ITEM_BYTES;
+
+    // Of a later life only what it has itself stays.
+    let (name, later) = (HostName::parse("r").unwrap(), Tag(5));
+    directory.follow(OWNER, later, &name, 1, Time(4), out);
+    directory.handle_delta(OWNER, later, delta(0, &[(1, "x")], 1), Time(5), out);
+    assert_eq!(directory.remote_bytes, ITEM_BYTES + 4 * 3 + 1);
+    directory.forget(OWNER, out);
+    assert_eq!(directory.remote_bytes, 0);
+}
+
+#[test]
+fn schemas_of_this_host_go_with_their_last_item_and_take_so_many_bytes_at_most() {
+    let mut directory = Directory::new();
+    let text = "x".repeat(60_000);
+    let with = |name: &str, number: u32| {
+        let mut hash = [0; 16];
+        hash[..4].copy_from_slice(&number.to_le_bytes());
+        ItemDescription {
+            schema_hash: SchemaHash(hash),
+            ..description(name)
+        }
+    };
+    // One program that changes its mind ever again.
+    for number in 0..2_000 {
+        directory
+            .announce(with("a", number), &text, Time(0))
+            .unwrap();
+    }
+    directory.withdraw(&description("a").name, Time(0));
+
+    let announced = (0..2_000).map(|number| {
+        let description = with(&number.to_string(), number);
+        directory.announce(description, &text, Time(0))
+    });
+    let refused: Vec<Error> = announced.filter_map(Result::err).collect();
+    assert_eq!(refused.len(), 2_000 - (64 << 20) / 60_000);
+    assert!(matches!(refused[0], Error::SchemasFull { .. }));
+}
+
+#[test]
+fn what_one_host_is_owed_is_little_and_the_rest_is_counted() {
+    let mut directory = Directory::new();
+    for number in 0..100_u8 {
+        let description = ItemDescription {
+            schema_hash: SchemaHash([number; 16]),
+            ..description(&number.to_string())
+        };
+        directory.announce(description, "u64", Time(0)).unwrap();
+    }
+    for number in 0..100 {
+        directory.handle_schema_request(LIFE, SchemaHash([number; 16]), 1, Time(1));
+    }
+    assert_eq!(directory.unanswered(), 100 - 64);
+    let ranges = (0..50).map(|from| Range { from, to: from + 1 });
+    directory.handle_pull(LIFE, ranges.collect(), Time(1));
+    assert_eq!(directory.unanswered(), 100 - 64 + 50 - 32);
 }
