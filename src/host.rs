@@ -32,6 +32,9 @@ use crate::manager::Manager;
 
 /// How often the daemon's own state is looked at, and written when it changed.
 const STATE_PERIOD: Duration = Duration::from_secs(1);
+/// News of the store that wait for the control loop, beside as many in the store's own channel: 65 MiB at worst, each with
+/// the text of a schema.
+const NEWS_MAX: usize = 1_024;
 
 /// What a daemon is started with.
 #[derive(Clone)]
@@ -152,9 +155,9 @@ struct Daemon {
     stopping: Arc<AtomicBool>,
     server: JoinHandle<Vec<Orphan>>,
     keeper: Option<JoinHandle<Keeper>>,
-    /// Drains the store's bounded channel at once, so that the control loop may call the store without a deadlock.
+    /// Hands the store's news to the control loop. While that is behind, programs wait; its own calls are answered.
     forwarder: JoinHandle<bool>,
-    events: tokio::sync::mpsc::UnboundedReceiver<StoreEvent>,
+    events: tokio::sync::mpsc::Receiver<StoreEvent>,
     network: Option<Network>,
     publisher: Publisher,
 }
@@ -200,10 +203,13 @@ impl Daemon {
                 server.orphans()
             })
             .context("starting the store's thread")?;
-        let (sender, events) = tokio::sync::mpsc::unbounded_channel();
+        let (sender, events) = tokio::sync::mpsc::channel(NEWS_MAX);
         let forwarder = thread::Builder::new()
             .name("ddx-events".to_owned())
-            .spawn(move || news.into_iter().all(|event| sender.send(event).is_ok()))
+            .spawn(move || {
+                let mut news = news.into_iter();
+                news.all(|event| sender.blocking_send(event).is_ok())
+            })
             .context("starting the thread that forwards the store's news")?;
         let network = match &config.key {
             Some(key) => Some(Network::start(config, identity, key, &handle)?),
@@ -262,6 +268,8 @@ impl Daemon {
             network.stop();
         }
         drop(self.publisher);
+        // Whoever forwards them may be waiting for room.
+        drop(self.events);
         self.stopping.store(true, Ordering::Relaxed);
         self.handle.wake();
         drop(self.handle);

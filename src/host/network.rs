@@ -70,7 +70,6 @@ pub(super) struct Network {
     control_traffic: Traffic,
     received: ReceiverCounters,
     host: HostName,
-    hosts: BTreeMap<HostId, HostName>,
     /// Texts of the schemas of this host's items.
     schemas: BTreeMap<ItemName, String>,
     /// Items of other hosts. Until it is known which of two hosts keeps a prefix, both may show one name.
@@ -194,7 +193,6 @@ impl Network {
             control_traffic: Traffic::default(),
             received: ReceiverCounters::default(),
             host: config.host.clone(),
-            hosts: BTreeMap::new(),
             schemas: BTreeMap::new(),
             remote: BTreeMap::new(),
             remote_changed: false,
@@ -461,11 +459,8 @@ impl Network {
 
     fn handle_event(&mut self, event: Event) -> anyhow::Result<()> {
         match event {
-            Event::HostUp {
-                host, name, addr, ..
-            } => {
+            Event::HostUp { name, addr, .. } => {
                 tracing::info!(host = %name, %addr, "host up");
-                self.hosts.insert(host, name);
             }
             Event::HostUnreachable { host } => {
                 tracing::info!(host = %self.host_name(host), "host unreachable");
@@ -489,7 +484,7 @@ impl Network {
                         name: name.clone(),
                         ..description
                     },
-                    schema: schema_text.to_string(),
+                    schema: schema_text,
                 };
                 self.remote.insert((name, host), item);
                 self.remote_changed = true;
@@ -651,7 +646,7 @@ impl Network {
         let text = self
             .remote_named(name)
             .find(|item| item.description.schema_hash == description.schema_hash)
-            .map(|item| item.schema.as_str())
+            .map(|item| item.schema.as_ref())
             .context("its schema is not known")?;
         let schema = Schema::parse(text).context("its owner's schema")?;
         anyhow::ensure!(
@@ -701,8 +696,8 @@ impl Network {
     }
 
     fn host_name(&self, host: HostId) -> HostName {
-        self.hosts
-            .get(&host)
+        self.catalog
+            .host_name(host)
             .cloned()
             .unwrap_or_else(|| HostName::sanitised(&host.short()))
     }

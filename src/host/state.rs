@@ -104,7 +104,7 @@ impl Publisher {
                 |network| books(network, &hosts),
             ),
         );
-        self.write("@/counters", &network.map_or_else(|| json!({}), counters));
+        self.write("@/counters", &self.counters(network));
         let notes = network
             .map(|network| notes(network, &hosts))
             .unwrap_or_default();
@@ -114,6 +114,23 @@ impl Publisher {
             }
             self.notes = notes;
         }
+    }
+
+    fn counters(&self, network: Option<&Network>) -> Value {
+        let mut counters = network.map(counters).unwrap_or_default();
+        // The server is gone only when the daemon stops.
+        let store = self.handle.counters().unwrap_or_default();
+        for (what, count) in [
+            ("bad_messages", store.bad_messages),
+            ("bad_segments", store.bad_segments),
+            ("overflows", store.overflows),
+            ("quota_refusals", store.quota_refusals),
+            ("turned_away", store.turned_away),
+            ("unkept", store.unkept),
+        ] {
+            counters.insert(format!("store_{what}"), count.into());
+        }
+        counters.into()
     }
 
     fn write(&mut self, name: &'static str, value: &Value) {
@@ -359,7 +376,7 @@ pub(super) fn name_of(tag: Tag, hosts: &[HostStatus]) -> String {
         .map_or_else(|| "?".to_owned(), |host| host.shown_as.clone())
 }
 
-fn counters(network: &Network) -> Value {
+fn counters(network: &Network) -> Map<String, Value> {
     let mut counters = Map::new();
     let mut add = |name: String, count: u64| {
         counters.insert(name, count.into());
@@ -400,7 +417,7 @@ fn counters(network: &Network) -> Value {
     ] {
         add(format!("data_{what}"), count);
     }
-    counters.into()
+    counters
 }
 
 /// Name of the counter of a reason to drop datagrams: one word, for programs that read it.

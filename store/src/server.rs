@@ -18,8 +18,8 @@ mod rundir;
 use std::collections::BTreeMap;
 use std::os::fd::OwnedFd;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender, SyncSender};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use ddx_wire::{HostName, ItemName};
@@ -66,7 +66,8 @@ pub struct Server {
     handle: Handle,
     events: Option<SyncSender<Event>>,
     keeper: Option<SyncSender<Keep>>,
-    /// Events that found the channel full; clients wait until it has taken them.
+    /// Events that found the channel full; programs wait until it has taken them. At most those of one turn, and of what
+    /// the daemon itself does meanwhile.
     held_back: Vec<Event>,
     accept_pause: bool,
 }
@@ -74,16 +75,25 @@ pub struct Server {
 /// What other threads use to talk to a running [`Server`].
 #[derive(Clone, Debug)]
 pub struct Handle {
+    /// Grows by what waits for an answer, and by one [`Command::Show`] for each half of `shown`.
     commands: Sender<Command>,
+    shown: Arc<Mutex<Shown>>,
     wake: Arc<OwnedFd>,
+}
+
+/// What listings show, where the server has not taken it yet: a later one takes the place of an earlier one, so that they
+/// do not pile up before a server that is slower.
+#[derive(Debug, Default)]
+struct Shown {
+    remote: Option<Vec<RemoteItem>>,
+    notes: Option<BTreeMap<ItemName, String>>,
 }
 
 /// What a [`Handle`] asks of its server.
 #[derive(Debug)]
 enum Command {
     Adopt { socket: OwnedFd, privileged: bool },
-    SetRemote(Vec<RemoteItem>),
-    SetNotes(BTreeMap<ItemName, String>),
+    Show,
     Subscribe(SyncSender<Event>),
     Counters(SyncSender<Counters>),
 }
@@ -125,6 +135,7 @@ impl Server {
             commands,
             handle: Handle {
                 commands: sender,
+                shown: Arc::default(),
                 wake: Arc::new(wake),
             },
             events: None,
@@ -179,16 +190,18 @@ impl Handle {
 
     /// Replaces what listings and descriptions show of other hosts.
     pub fn set_remote(&self, items: Vec<RemoteItem>) -> Result<(), Error> {
-        self.command(Command::SetRemote(items))
+        let before = self.shown().remote.replace(items);
+        self.show(before.is_some())
     }
 
     /// Replaces what descriptions say of each item's way here.
     pub fn set_notes(&self, notes: BTreeMap<ItemName, String>) -> Result<(), Error> {
-        self.command(Command::SetNotes(notes))
+        let before = self.shown().notes.replace(notes);
+        self.show(before.is_some())
     }
 
-    /// What happens from now on. The channel holds 1,024 events; while it is full, clients of the daemon wait. A later
-    /// call takes the place of an earlier one.
+    /// What happens from now on. The channel holds 1,024 events; while it is full, programs wait, but stores that were opened
+    /// by [`Handle::connect`] are answered. A later call takes the place of an earlier one.
     pub fn events(&self) -> Result<Receiver<Event>, Error> {
         let (sender, receiver) = mpsc::sync_channel(EVENTS);
         self.command(Command::Subscribe(sender))?;
@@ -208,6 +221,23 @@ impl Handle {
         let _full = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 
+    fn shown(&self) -> MutexGuard<'_, Shown> {
+        // Each half is replaced whole, so a panic elsewhere leaves it sound.
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn take_shown(&self) -> Shown {
+        std::mem::take(&mut *self.shown())
+    }
+
+    /// Has the server take what is shown, unless it was told and has not yet.
+    fn show(&self, is_told: bool) -> Result<(), Error> {
+        if is_told {
+            return Ok(());
+        }
+        self.command(Command::Show)
+    }
+
     fn command(&self, command: Command) -> Result<(), Error> {
         self.commands.send(command).map_err(|_| Error::Gone)?;
         self.wake();
@@ -215,5 +245,29 @@ impl Handle {
     }
 }
 
-/// Events that may wait for the daemon: enough for all items of a client that dies.
+/// Events that may wait for the daemon: enough for all items of a client that dies. One has 1 KiB and perhaps the text of a
+/// schema, so that these are 65 MiB at worst.
 const EVENTS: usize = 1024;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_shown_does_not_pile_up_before_a_server_that_is_slow() {
+        let host = HostName::parse("h").unwrap();
+        let mut server = Server::bind(Config::new(host)).unwrap();
+        let handle = server.handle();
+        for _ in 0..1_000 {
+            handle.set_remote(Vec::new()).unwrap();
+            handle.set_notes(BTreeMap::new()).unwrap();
+        }
+        assert_eq!(server.commands.try_iter().count(), 2);
+        // The latest is taken, and then there is a next.
+        let shown = server.handle.take_shown();
+        assert!(shown.remote.is_some() && shown.notes.is_some());
+        handle.set_remote(Vec::new()).unwrap();
+        assert_eq!(server.commands.try_iter().count(), 1);
+        server.turn(Duration::ZERO).unwrap();
+    }
+}

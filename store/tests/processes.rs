@@ -532,6 +532,31 @@ fn own_items_are_announced_changed_and_withdrawn() {
 }
 
 #[test]
+fn while_the_daemon_is_behind_with_news_programs_wait_and_its_own_calls_are_answered() {
+    let daemon = daemon();
+    let events = daemon.handle().events().unwrap();
+    let (store, inside) = (daemon.store(), daemon.handle().connect().unwrap());
+    // Three events each, which nobody takes: more than the channel holds.
+    let turn = || {
+        drop(inside.writer::<u64>("n").unwrap());
+        inside.remove("n").unwrap();
+    };
+    (0..400).for_each(|_| turn());
+
+    thread::scope(|scope| {
+        let program = scope.spawn(|| store.writer::<u64>("p").map(drop));
+        (0..400).for_each(|_| turn());
+        assert!(!program.is_finished(), "it was served before its turn");
+
+        let next = || events.recv_timeout(LONG).unwrap();
+        let is_p = |event: &Event| matches!(event, Event::Announced { description, .. } if description.name.as_str() == "host/p");
+        let before = (0..).take_while(|_| !is_p(&next())).count();
+        assert!(before >= 3 * 800, "{before}");
+        program.join().unwrap().unwrap();
+    });
+}
+
+#[test]
 fn a_guard_outlives_its_writer_and_its_segment() {
     let daemon = daemon();
     let store = daemon.store();

@@ -57,6 +57,22 @@ fn meaning(what: &str, domain: u16) -> Option<(&'static str, String)> {
             "news of samples that a reader will not get that found no room and are told again later",
             "`ddx stat` shows where samples are overwritten or too old; a lower rate or a deeper ring relieves the link",
         ),
+        "overflows" => (
+            "programs that were cut off because they did not collect the daemon's answers",
+            "such a program is stopped or hangs; `quotas` in deploy/ddx.toml has the limit",
+        ),
+        "quota_refusals" | "turned_away" => (
+            "requests or connections of programs beyond what one program, or all, may take",
+            "the program was told which limit; `quotas` in deploy/ddx.toml sets them",
+        ),
+        "unkept" => (
+            "items without a writer that may not outlive this daemon, because too many changed at once",
+            "`ddx ls` shows them; write them again after a restart",
+        ),
+        "bad_messages" | "bad_segments" => (
+            "messages or memory of programs that are not as they must be",
+            "build that program with this version: `ddx --version`",
+        ),
         "stale_lives" => (
             "greetings of an earlier life of a host",
             "two machines with a copied disk share one identity: remove /var/lib/ddx on one of them and restart it",

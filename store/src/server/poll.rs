@@ -11,7 +11,7 @@ use rustix::event::{PollFd, PollFlags};
 use tracing::{debug, warn};
 
 use super::registry::{ClientId, Effect};
-use super::{Command, Server};
+use super::{Command, Server, Shown};
 use crate::clock;
 use crate::control::{Notice, ToClient};
 use crate::descriptor::{PeerProcess, peer_process};
@@ -48,6 +48,8 @@ pub(super) struct Peer {
     process: Option<OwnedFd>,
     waiting: VecDeque<Outgoing>,
     waiting_bytes: usize,
+    /// The daemon's own, which is answered also while the daemon is behind: else it might wait for itself.
+    privileged: bool,
 }
 
 #[derive(Debug)]
@@ -107,6 +109,7 @@ impl Server {
                     process,
                     waiting: VecDeque::new(),
                     waiting_bytes: 0,
+                    privileged,
                 };
                 self.peers.insert(client, peer);
             }
@@ -127,7 +130,7 @@ impl Server {
         let first = fds.len();
         for peer in self.peers.values() {
             let mut flags = PollFlags::empty();
-            flags.set(PollFlags::IN, !is_behind);
+            flags.set(PollFlags::IN, !is_behind || peer.privileged);
             flags.set(PollFlags::OUT, !peer.waiting.is_empty());
             fds.push(PollFd::new(&*peer.socket, flags));
         }
@@ -162,8 +165,15 @@ impl Server {
         while let Ok(command) = self.commands.try_recv() {
             match command {
                 Command::Adopt { socket, privileged } => self.adopt(socket, None, privileged),
-                Command::SetRemote(items) => self.registry.set_remote(items),
-                Command::SetNotes(notes) => self.registry.set_notes(notes),
+                Command::Show => {
+                    let Shown { remote, notes } = self.handle.take_shown();
+                    if let Some(items) = remote {
+                        self.registry.set_remote(items);
+                    }
+                    if let Some(notes) = notes {
+                        self.registry.set_notes(notes);
+                    }
+                }
                 Command::Subscribe(events) => self.events = Some(events),
                 Command::Counters(to) => {
                     let _gone = to.try_send(self.registry.counters());
@@ -251,6 +261,7 @@ impl Server {
                         && let Err(TrySendError::Full(keep)) = keeper.try_send(keep)
                     {
                         warn!(%keep, "this is not told to whoever keeps it");
+                        self.registry.count_unkept();
                     }
                 }
                 Effect::Event(event) => {

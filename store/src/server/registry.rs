@@ -105,8 +105,8 @@ pub struct RemoteItem {
     pub host: HostName,
     /// What that host says of it.
     pub description: ItemDescription,
-    /// Text of its schema; empty while unknown.
-    pub schema: String,
+    /// Text of its schema, which many items may share; empty while unknown.
+    pub schema: Arc<str>,
 }
 
 /// Clients that were cut off, by reason.
@@ -122,6 +122,9 @@ pub struct Counters {
     pub bad_segments: u64,
     /// Connections closed at once because there were too many.
     pub turned_away: u64,
+    /// Changes of items without a writer that whoever keeps them was not told, because too many wait: such an item may not
+    /// outlive the daemon, or be kept for nothing.
+    pub unkept: u64,
 }
 
 /// The daemon's state.
@@ -276,6 +279,11 @@ impl Registry {
     /// The next thing to do.
     pub fn poll_effect(&mut self) -> Option<Effect> {
         self.effects.pop_front()
+    }
+
+    /// Counts a change of an item without a writer that nobody was told.
+    pub(super) fn count_unkept(&mut self) {
+        self.counters.unkept += 1;
     }
 
     /// What went wrong so far.

@@ -474,7 +474,7 @@ fn remote(input: &mut Input<'_>) -> RemoteItem {
             writer: WriterState::Live,
             program: String::from_utf8_lossy(input.bytes(64)).into_owned(),
         },
-        schema: text(input, &SCHEMAS),
+        schema: text(input, &SCHEMAS).into(),
     }
 }
 

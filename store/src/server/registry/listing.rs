@@ -51,7 +51,7 @@ impl Registry {
                 (Some(tenure), _) => tenure.schema.text().to_owned(),
                 // A longer one fits no answer, and no program here could read the item.
                 (None, Some(remote)) if remote.schema.len() <= SCHEMA_MAX_BYTES => {
-                    remote.schema.clone()
+                    remote.schema.as_ref().to_owned()
                 }
                 (None, Some(_) | None) => String::new(),
             },

@@ -257,7 +257,7 @@ fn a_description_fits_one_message_whatever_others_have_said() {
         schema: Schema::raw("far", "json", &"x".repeat(60_000))
             .unwrap()
             .text()
-            .to_owned(),
+            .into(),
     }]);
 
     for (name, refused) in [("n", 64), ("base/x", 0)] {
