@@ -300,8 +300,7 @@ impl State {
             } => {
                 let now = ddx_store::now();
                 let held = self.inbound.mirrors.get(&mirror);
-                let held = held.filter(|held| held.from == Some(tag));
-                let after = held.map(|held| held.newest);
+                let after = held.and_then(|held| held.until(tag));
                 self.receiver.resume(tag, stream, &contract, after, now);
                 let fresh = Stream {
                     mirror,
@@ -434,6 +433,16 @@ impl Inbound {
 }
 
 impl Mirror {
+    /// Where another stream goes on. Of another life than the last one's all is new, from its beginning.
+    fn until(&self, tag: Tag) -> Option<(Epoch, Seq)> {
+        let from = self.from?;
+        Some(if from == tag {
+            self.newest
+        } else {
+            (Epoch(0), Seq(0))
+        })
+    }
+
     fn take(&mut self, sample: &Received<'_>, clock: Option<&ClockOffset>, now: Time) -> Fate {
         let meta = &sample.meta;
         if (meta.epoch, meta.seq) <= self.newest {

@@ -110,18 +110,22 @@ struct Newest {
     epoch: Epoch,
     seq: Seq,
     filtered: u64,
+    /// It came by another stream: of this one what lies before the next was not asked, and so is left out by its source,
+    /// however many it counts itself.
+    is_unasked: bool,
     /// Bit `n` tells whether the sample `n` before the newest is accounted for otherwise than as lost.
     settled: u64,
 }
 
 impl Ledger {
-    /// Goes on after a sample that was delivered by another stream of the item: what lies behind it counts.
-    pub(super) fn resume(&mut self, epoch: Epoch, seq: Seq) {
+    /// Goes on after a sample that was delivered by another stream of the item: what lies behind it counts. Where each is
+    /// wanted it is asked for.
+    pub(super) fn resume(&mut self, epoch: Epoch, seq: Seq, is_every: bool) {
         self.newest = Some(Newest {
             epoch,
             seq,
-            // A stream counts all before its first sample as left out.
-            filtered: seq.0,
+            filtered: 0,
+            is_unasked: !is_every,
             settled: u64::MAX,
         });
     }
@@ -158,6 +162,9 @@ impl Ledger {
             Some(_) | None => self.books.duplicates += 1,
         }
         if behind == 0 {
+            if std::mem::take(&mut newest.is_unasked) {
+                newest.filtered = meta.filtered;
+            }
             Standing::Again
         } else {
             Standing::Old
@@ -181,6 +188,10 @@ impl Ledger {
             }
             Some(_) => (meta.seq.0.saturating_sub(1), meta.filtered, 1),
         };
+        let filtered = match self.newest {
+            Some(last) if last.is_unasked => skipped,
+            Some(_) | None => filtered,
+        };
         let left_out = std::mem::take(&mut self.left_out);
         let filtered = filtered.saturating_add(left_out).min(skipped);
         // What failed before the first sample lies outside the range that the books are about.
@@ -189,6 +200,7 @@ impl Ledger {
                 .retain(|(epoch, seq, _)| (*epoch, *seq) > key(meta));
         }
         let books = &mut self.books;
+        let filtered_before = books.filtered;
         books.expected = books.expected.saturating_add(skipped).saturating_add(1);
         books.delivered += 1;
         books.filtered = books.filtered.saturating_add(filtered);
@@ -202,6 +214,7 @@ impl Ledger {
             epoch: meta.epoch,
             seq: meta.seq,
             filtered: meta.filtered,
+            is_unasked: false,
             settled,
         };
         if is_told && lost == 0 {
@@ -232,7 +245,8 @@ impl Ledger {
         self.newest = Some(newest);
         Passed {
             overwritten: gone,
-            filtered,
+            // Without those of which parts arrived.
+            filtered: self.books.filtered.saturating_sub(filtered_before),
         }
     }
 
@@ -454,7 +468,7 @@ mod tests {
     #[test]
     fn a_stream_that_goes_on_for_another_counts_what_lies_between() {
         let mut ledger = Ledger::default();
-        ledger.resume(Epoch(1), Seq(10));
+        ledger.resume(Epoch(1), Seq(10), false);
         assert_eq!(ledger.judge(&meta(1, 10, 9)), Standing::Again);
         // Its first sample says that all before were left out, as of a new stream they were.
         let passed = ledger.deliver(&meta(1, 15, 14));
@@ -465,6 +479,42 @@ mod tests {
         assert_eq!((books.expected, books.delivered), (7, 2));
         assert_eq!((books.filtered, books.link_lost), (4, 1));
         assert!(books.balanced());
+    }
+
+    #[test]
+    fn what_lies_before_the_first_of_a_stream_that_others_read_was_not_asked_of_it() {
+        for (epoch, missed) in [(1, 4), (2, 14)] {
+            for (is_every, filtered) in [(false, missed), (true, 0)] {
+                let mut ledger = Ledger::default();
+                ledger.resume(Epoch(1), Seq(10), is_every);
+                // It left out none for those.
+                assert_eq!(ledger.deliver(&meta(epoch, 15, 0)).filtered, filtered);
+                assert_eq!(ledger.deliver(&meta(epoch, 17, 0)).filtered, 0);
+                let books = ledger.books();
+                assert_eq!(books.link_lost, missed - filtered + 1, "{books:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_came_in_part_is_not_told_to_be_left_out() {
+        let mut ledger = after(&[(1, 1, 0)]);
+        ledger.fail(&meta(1, 2, 0), Failure::Expired);
+        ledger.fail(&meta(1, 3, 0), Failure::Expired);
+        assert_eq!(ledger.deliver(&meta(1, 4, 1)).filtered, 0);
+        let books = ledger.books();
+        assert_eq!((books.expired, books.filtered), (2, 0), "{books:?}");
+    }
+
+    #[test]
+    fn a_stream_that_begins_with_what_is_held_counts_from_there() {
+        let mut ledger = Ledger::default();
+        ledger.resume(Epoch(1), Seq(10), false);
+        assert_eq!(ledger.judge(&meta(1, 10, 9)), Standing::Again);
+        // The contract left one out.
+        assert_eq!(ledger.deliver(&meta(1, 12, 10)).filtered, 1);
+        let books = ledger.books();
+        assert_eq!((books.filtered, books.link_lost), (1, 0), "{books:?}");
     }
 
     #[test]

@@ -170,7 +170,8 @@ impl Receiver {
         self.resume(tag, stream, contract, None, now);
     }
 
-    /// The same for one that goes on where another stream of the same item ended: with what follows the sample `after`.
+    /// The same for one that goes on where another stream of the same item ended: with what follows the sample `after`. Epoch
+    /// and number 0 are before all that another life of its owner has.
     pub fn resume(
         &mut self,
         tag: Tag,
@@ -194,7 +195,7 @@ impl Receiver {
                 ..Stream::default()
             };
             if let Some((epoch, seq)) = after {
-                fresh.ledger.resume(epoch, seq);
+                fresh.ledger.resume(epoch, seq, fresh.order.is_some());
                 if let Some(order) = &mut fresh.order {
                     order.resume(epoch, seq);
                 }

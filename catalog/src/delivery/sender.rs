@@ -131,6 +131,7 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             readers: Vec::new(),
             destinations: Vec::new(),
             newest: None,
+            present: None,
             expired: None,
             counters: StreamCounters::default(),
             books: SourceBooks::default(),
@@ -279,6 +280,9 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             Some(_) if admitted => (stream.advance(meta), payload),
             Some(_) | None => (stream.complete(meta), payload),
         });
+        if let Some((meta, _)) = found.as_ref().filter(|_| admitted) {
+            stream.begin(meta);
+        }
         if new.is_some() && admitted {
             stream.counters.sent += 1;
             for to in stream.destinations.iter().filter(|to| **to != fetch.to) {

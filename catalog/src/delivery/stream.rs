@@ -20,6 +20,8 @@ pub(super) struct Stream {
     pub(super) readers: Vec<Reader>,
     pub(super) destinations: Vec<SocketAddr>,
     pub(super) newest: Option<(Epoch, Seq)>,
+    /// The present value that new readers got before any sample was offered: from it they count what is left out.
+    pub(super) present: Option<(Epoch, Seq)>,
     pub(super) expired: Option<(Epoch, Seq)>,
     pub(super) counters: StreamCounters,
     pub(super) books: SourceBooks,
@@ -105,6 +107,12 @@ impl Stream {
             false => &mut books.expired,
         };
         *fate += 1;
+        let is_next = self.newest.is_some_and(|(epoch, _)| epoch == meta.epoch);
+        if !admitted && left_to_ways && is_next {
+            // No way leaves this one out for itself.
+            self.filtered = self.filtered.saturating_add(1);
+        }
+        let books = &mut self.books;
         books.bytes = books.bytes.saturating_add(payload.len() as u64);
     }
 
@@ -121,7 +129,7 @@ impl Stream {
     /// The same for one that goes out of turn, perhaps before the contract lets it go to all.
     pub(super) fn complete(&self, meta: &SampleMeta) -> SampleMeta {
         let (epoch, Seq(seq)) = key(meta);
-        let filtered = match self.newest {
+        let filtered = match self.newest.or(self.present) {
             // What is left out of these is told one by one.
             _ if self.contract.delivery != Delivery::Latest => 0,
             Some((last, _)) if last == epoch && self.leaves_out_by_way() => self.filtered,
@@ -134,6 +142,13 @@ impl Stream {
         SampleMeta {
             filtered: filtered.min(seq.saturating_sub(1)),
             ..*meta
+        }
+    }
+
+    /// Takes note of a sample that goes out of turn: the first of the stream, if there was none.
+    pub(super) fn begin(&mut self, meta: &SampleMeta) {
+        if self.newest.or(self.present).is_none() {
+            (self.present, self.filtered) = (Some(key(meta)), meta.filtered);
         }
     }
 

@@ -9,6 +9,7 @@ use proptest::prelude::*;
 use super::*;
 
 mod bounds;
+mod counts;
 mod every;
 mod link;
 
