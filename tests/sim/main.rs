@@ -8,6 +8,7 @@
 //! | `paths.rs` | samples flow on when an address, a link or a network of several goes |
 //! | `matrix.rs` | samples of all sizes over each link profile, in a time that the link explains, with exact books |
 //! | `share.rs` | what shares a link: unlike priorities, commands beside bulk, unlike viewers, a group that loses |
+//! | `books.rs` | the fates of samples add up on each hop, the hops agree, and readers are told |
 //! | `chance.rs` | the same under whatever a seed thinks up, with each sample judged |
 //!
 //! A failure prints its seed and the line that replays it. `DDX_SEED=n` runs that seed alone, `DDX_SEEDS=n` runs as many
@@ -18,6 +19,7 @@
     reason = "a helper of a test fails the test, as the test itself would"
 )]
 
+mod books;
 mod chance;
 mod delivery;
 mod directory;

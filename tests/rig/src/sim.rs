@@ -32,6 +32,7 @@ use host::HostClock;
 pub use net::Link;
 use net::{CONTROL_PORT, DATA_PORT, Net, Target, Way};
 use networks::Networks;
+pub use rx::Told;
 pub use tx::Counts;
 
 /// A lease lasts three seconds and is looked at four times a second; the rest is for queues and slow clocks.

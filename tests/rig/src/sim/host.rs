@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use ddx_catalog::delivery::{Books, PathStatus, ReceiverEvent, Route};
+use ddx_catalog::delivery::{Books, PathStatus, ReceiverEvent, Route, SentBooks, SourceBooks};
 use ddx_catalog::{Catalog, Config, Dest, Event};
 use ddx_wire::message::{NackEntry, ReportEntry};
 use ddx_wire::seal::{DomainKey, Opener, Purpose, Sealer};
@@ -16,7 +16,7 @@ use ddx_wire::{
     StreamId, Tag, Time, WriterState,
 };
 
-use super::rx::{Mirror, MirrorId, Rx};
+use super::rx::{Mirror, MirrorId, Rx, Told};
 use super::store::Store;
 use super::tx::{Counts, Tx};
 use crate::random::Random;
@@ -256,6 +256,31 @@ impl Host {
         self.data.as_ref().map(books).unwrap_or_default()
     }
 
+    /// What a reader of an item of another host was told, and what all streams that brought it have counted.
+    pub fn told(&self, name: &ItemName) -> Option<(Told, Books)> {
+        let data = self.data.as_ref()?;
+        let (mirror, _) = data.mirrors.get(name)?;
+        let told = data.rx.mirrors.get(mirror)?.told;
+        Some((told, data.rx.books_of(*mirror)?))
+    }
+
+    /// The books of a stream that it reads.
+    pub fn books_of(&self, tag: Tag, stream: StreamId) -> Option<Books> {
+        self.data.as_ref()?.rx.receiver.books(tag, stream)
+    }
+
+    /// What became of the samples of each stream that it sends, before any way.
+    pub fn source_books(&self) -> Vec<(StreamId, SourceBooks)> {
+        let books = |data: &Data| data.tx.sender.source_books().collect();
+        self.data.as_ref().map(books).unwrap_or_default()
+    }
+
+    /// What became of them on each way.
+    pub fn sent_books(&self) -> Vec<(StreamId, SocketAddr, SentBooks)> {
+        let books = |data: &Data| data.tx.sender.sent_books().collect();
+        self.data.as_ref().map(books).unwrap_or_default()
+    }
+
     pub(super) fn open_writer(&mut self, name: &ItemName, now: Moment) {
         let (Some(data), Some(catalog)) = (&mut self.data, &mut self.catalog) else {
             return;
@@ -477,8 +502,7 @@ impl Data {
             Order::Session(tag, opener) => self.rx.receiver.session(tag, opener),
             Order::DropSession(tag) => self.rx.drop_session(tag),
             Order::Mirror(id, name) => {
-                let newest = Default::default();
-                self.rx.mirrors.insert(id, Mirror { name, newest });
+                self.rx.mirrors.insert(id, Mirror::new(name));
             }
             Order::DropMirror(id) => self.rx.drop_mirror(id),
             Order::Expect(at, contract, mirror) => self.rx.expect(at, &contract, mirror, now),

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use ddx_catalog::delivery::{Books, Received, Receiver, ReceiverConfig};
+use ddx_catalog::delivery::{Books, Passed, Received, Receiver, ReceiverConfig};
 use ddx_wire::seal::KeyId;
 use ddx_wire::{ClockOffset, Contract, Epoch, ItemName, Seq, StreamId, Tag, Time};
 
 use super::HostClock;
-use super::store::Told;
+use super::store::Payload;
 
 /// Number of a mirror.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -32,6 +32,35 @@ pub(super) struct Rx {
 pub(super) struct Mirror {
     pub(super) name: ItemName,
     pub(super) newest: (Epoch, Seq),
+    /// Who sent that: another stream of the same life goes on where it ended.
+    from: Option<Tag>,
+    /// Samples of the epoch that the source did not send, as the mirror's stamps say.
+    passed: Passed,
+    pub(super) told: Told,
+    /// The books of its streams that are over.
+    former: Books,
+}
+
+/// What a reader of a mirror is told that reads each sample at once. `expected` is the sum of those from `delivered` to
+/// `lost`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Told {
+    /// Samples from the first to the newest, by their numbers, over all epochs.
+    pub expected: u64,
+    /// Shown.
+    pub delivered: u64,
+    /// Overwritten at their source.
+    pub overwritten: u64,
+    /// Left out by their source.
+    pub filtered: u64,
+    /// Lost on the way.
+    pub lost: u64,
+    /// Further copies that were not shown.
+    pub stale: u64,
+    /// Lives of hosts from which it came.
+    pub lives: u32,
+    /// The first one.
+    pub first: (Epoch, Seq),
 }
 
 /// A second, plainer account of what came by a stream.
@@ -64,10 +93,12 @@ impl Rx {
         mirror: MirrorId,
         now: Time,
     ) {
-        self.receiver.listen(tag, stream, contract, now);
+        let held = self.mirrors.get(&mirror);
+        let after = held.and_then(|held| held.until(tag));
+        self.receiver.resume(tag, stream, contract, after, now);
         let fresh = Stream {
             mirror,
-            newest: None,
+            newest: after,
             expected: 0,
             delivered: 0,
         };
@@ -77,8 +108,13 @@ impl Rx {
 
     pub(super) fn forget(&mut self, tag: Tag, stream: StreamId) {
         self.check_books(tag, stream);
+        let books = self.receiver.books(tag, stream);
+        let over = self.streams.remove(&(tag, stream));
+        let mirror = over.and_then(|over| self.mirrors.get_mut(&over.mirror));
+        if let (Some(mirror), Some(books)) = (mirror, books) {
+            mirror.former = sum(mirror.former, books);
+        }
         self.receiver.forget(tag, stream);
-        self.streams.remove(&(tag, stream));
     }
 
     pub(super) fn set_clock(&mut self, tag: Tag, offset: ClockOffset, now: Time) {
@@ -148,6 +184,16 @@ impl Rx {
             .filter_map(|(tag, stream)| self.receiver.books(*tag, *stream))
     }
 
+    /// What the streams of a mirror have counted, former and present.
+    pub(super) fn books_of(&self, mirror: MirrorId) -> Option<Books> {
+        let streams = self
+            .streams
+            .iter()
+            .filter(|(_, stream)| stream.mirror == mirror);
+        let books = streams.filter_map(|((tag, id), _)| self.receiver.books(*tag, *id));
+        Some(books.fold(self.mirrors.get(&mirror)?.former, sum))
+    }
+
     fn take(&mut self, sample: &Received<'_>, now: Time) {
         let Some(stream) = self.streams.get_mut(&(sample.tag, sample.stream)) else {
             return;
@@ -160,7 +206,7 @@ impl Rx {
             return;
         };
         let newest = (sample.meta.epoch, sample.meta.seq);
-        let Some(told) = Told::read(&mirror.name, sample.payload) else {
+        let Some(told) = Payload::read(&mirror.name, sample.payload) else {
             self.broken.push(format!("`{}` is torn", mirror.name));
             return;
         };
@@ -169,9 +215,16 @@ impl Rx {
             self.broken.push(text);
         }
         if newest <= mirror.newest {
+            mirror.told.stale += 1;
             return;
         }
-        mirror.newest = newest;
+        if !mirror.show(sample) {
+            let text = format!(
+                "`{}` is told of more than lies before it: {sample:?}",
+                mirror.name
+            );
+            self.broken.push(text);
+        }
         self.shown_samples += 1;
         let before = self.shown.insert((mirror.name.clone(), told.owner), newest);
         if before > Some(newest) {
@@ -207,6 +260,85 @@ impl Rx {
                 stream.delivered, stream.expected
             ));
         }
+    }
+}
+
+impl Mirror {
+    pub(super) fn new(name: ItemName) -> Self {
+        Self {
+            name,
+            newest: Default::default(),
+            from: None,
+            passed: Passed::default(),
+            told: Told::default(),
+            former: Books::default(),
+        }
+    }
+
+    /// Where another stream goes on, as in the daemon.
+    fn until(&self, tag: Tag) -> Option<(Epoch, Seq)> {
+        let from = self.from?;
+        Some(if from == tag {
+            self.newest
+        } else {
+            (Epoch(0), Seq(0))
+        })
+    }
+
+    /// Writes a sample, as the daemon does, and reads it, as the store does. `false` when the source claims more than there
+    /// is.
+    fn show(&mut self, sample: &Received<'_>) -> bool {
+        let (meta, more) = (&sample.meta, sample.passed);
+        let before = match self.newest {
+            (Epoch(0), _) => None,
+            newest => Some(newest),
+        };
+        let is_same = before.is_some_and(|(epoch, _)| epoch == meta.epoch);
+        let told = &mut self.told;
+        told.lives += u32::from(self.from != Some(sample.tag));
+        told.delivered += 1;
+        self.from = Some(sample.tag);
+        self.newest = (meta.epoch, meta.seq);
+        let Some((_, Seq(last))) = before else {
+            // Nobody here asked for what was before.
+            (told.first, told.expected) = (self.newest, 1);
+            self.passed = Passed {
+                filtered: meta.seq.0.saturating_sub(1),
+                overwritten: 0,
+            };
+            return true;
+        };
+        let (last, passed) = match is_same {
+            true => (last, self.passed),
+            false => (0, Passed::default()),
+        };
+        self.passed = Passed {
+            filtered: passed.filtered + more.filtered,
+            overwritten: passed.overwritten + more.overwritten,
+        };
+        let gap = meta.seq.0 - last - 1;
+        told.expected += gap + 1;
+        told.filtered += more.filtered;
+        told.overwritten += more.overwritten;
+        let lost = gap.checked_sub(more.filtered + more.overwritten);
+        told.lost += lost.unwrap_or_default();
+        lost.is_some()
+    }
+}
+
+fn sum(a: Books, b: Books) -> Books {
+    Books {
+        expected: a.expected + b.expected,
+        delivered: a.delivered + b.delivered,
+        late: a.late + b.late,
+        link_lost: a.link_lost + b.link_lost,
+        expired: a.expired + b.expired,
+        over_budget: a.over_budget + b.over_budget,
+        undecodable: a.undecodable + b.undecodable,
+        filtered: a.filtered + b.filtered,
+        overwritten: a.overwritten + b.overwritten,
+        duplicates: a.duplicates + b.duplicates,
+        old_epoch: a.old_epoch + b.old_epoch,
     }
 }
 

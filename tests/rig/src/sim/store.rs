@@ -39,7 +39,7 @@ pub(super) struct Sample {
 
 /// What a payload says of itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Told {
+pub(super) struct Payload {
     /// Number of the host that wrote it.
     pub(super) owner: u64,
     pub(super) epoch: Epoch,
@@ -85,7 +85,7 @@ impl Store {
         let item = self.items.get_mut(name)?;
         item.last_pos += 1;
         item.last_seq += 1;
-        let told = Told {
+        let told = Payload {
             owner,
             epoch: item.epoch,
             seq: Seq(item.last_seq),
@@ -130,7 +130,7 @@ impl Item {
     }
 }
 
-impl Told {
+impl Payload {
     /// Bytes that only this sample of this item can have.
     fn payload(self, name: &ItemName, len: usize) -> Vec<u8> {
         let words = [
