@@ -122,6 +122,10 @@ impl Congestion {
         if let Some(rate) = self.before_silence.take() {
             // The link is back, perhaps as it was.
             self.bytes_per_second = (rate / 2.0).max(self.bytes_per_second);
+            // What did not arrive while it was cut says nothing of what it carries.
+            self.arrived.clear();
+            self.queue = way.queue;
+            return;
         }
         let Way {
             queue,
