@@ -127,7 +127,7 @@ const GROUPS: u16 = 16;
 /// Paths of one host that are remembered.
 const PATHS: usize = 64;
 /// Datagrams that a share is known from at most: what was before fades.
-const WEIGHT: f64 = 50.0;
+const WEIGHT: f64 = 100.0;
 /// Datagrams below which a share says nothing.
 const WEIGHT_MIN: f64 = 12.0;
 /// A group that loses so much more than unicast is not used: what unicast costs more is less than what repairs would.
@@ -195,17 +195,19 @@ mod tests {
     }
 
     #[test]
-    fn chance_does_not_end_a_group_that_loses_one_in_three_as_unicast_does() {
+    fn chance_does_not_end_a_group_that_loses_one_in_three_as_unicast_does_or_may() {
         let mut rng = crate::rng::Rng::new(5);
-        let mut quality = Quality::default();
-        let mut counts = [(1, 1); 2];
-        for step in 0..100_000 {
-            for (path, (highest, received)) in [3, 100].into_iter().zip(&mut counts) {
-                *highest += 5;
-                *received += (0..5).map(|_| u32::from(rng.below(3) > 0)).sum::<u32>();
-                let is_worse =
-                    quality.handle_report(&report(path, *highest, *received), Time(step));
-                assert!(!is_worse, "after {step} reports");
+        for paths in [vec![3, 100], vec![3]] {
+            let mut quality = Quality::default();
+            let mut counts = vec![(1, 1); paths.len()];
+            for step in 0..100_000 {
+                for (path, (highest, received)) in paths.iter().zip(&mut counts) {
+                    *highest += 5;
+                    *received += (0..5).map(|_| u32::from(rng.below(3) > 0)).sum::<u32>();
+                    let report = report(*path, *highest, *received);
+                    let is_worse = quality.handle_report(&report, Time(step));
+                    assert!(!is_worse, "{paths:?} after {step} reports");
+                }
             }
         }
     }
