@@ -107,7 +107,8 @@ fn send(site: &Site, delivery: Delivery, bytes: usize) -> Vec<Duration> {
 }
 
 /// When a sample should be there: its time at the rate with what loss costs, some round trips for repairs, all of it
-/// three times over, and the slices of a busy machine.
+/// three times over, and the slices of a busy machine. A burst of loss ends with the datagrams that it takes: while one
+/// sample waits, these are requests and repeats, at least 60 ms apart.
 fn bound(profile: Option<&Profile>, bytes: usize) -> Duration {
     let (rate, loss, way) = profile.map_or((MACHINE, 0.0, Duration::ZERO), |profile| {
         let BitsPerSecond(rate) = profile.down.rate.unwrap();
@@ -117,7 +118,8 @@ fn bound(profile: Option<&Profile>, bytes: usize) -> Duration {
     });
     let bits = f64::from(u32::try_from(bytes).unwrap()) * 8.0;
     let ideal = Duration::from_secs_f64(bits / rate / (1.0 - loss));
-    3 * (ideal + 4 * way + Duration::from_millis(100))
+    let burst = profile.map_or(0.0, |profile| profile.down.loss.burst.max(1.0) - 1.0);
+    3 * (ideal + 4 * way + Duration::from_millis(100)) + Duration::from_millis(300).mul_f64(burst)
 }
 
 /// What the wire carries beside other work, bits per second.

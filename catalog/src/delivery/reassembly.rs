@@ -226,8 +226,8 @@ impl Reassembly {
         }
         let is_quiet = now.since(partial.last) >= partial.tail_wait();
         let parts = partial.missing(is_quiet);
-        // The answer takes a round trip, and comes at the sender's pace.
-        let backoff = 1 << partial.asked.min(3);
+        // The answer takes a round trip, and comes at the sender's pace. A burst of loss ends only when something is sent.
+        let backoff = 1 << partial.asked.min(1);
         partial.asked += 1;
         let wait = (partial.round_trip + REORDERING) * backoff + partial.patience;
         self.deadlines.set(place, now + wait);
