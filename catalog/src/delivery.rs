@@ -197,6 +197,15 @@ pub struct Received<'a> {
     pub passed: Passed,
 }
 
+/// What is here of an item already, when another stream of it begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Held {
+    /// Who sent the newest sample.
+    pub from: Tag,
+    /// Its epoch and number.
+    pub newest: (Epoch, Seq),
+}
+
 /// Samples that a source did not send, by cause. Each of a stream lies before some sample that was delivered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Passed {

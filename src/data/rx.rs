@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ddx_catalog::delivery::{
-    Passed, Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent,
+    Held, Passed, Received, Receiver, ReceiverConfig, ReceiverCounters, ReceiverEvent,
 };
 use ddx_store::{Origin, RawWriter};
 use ddx_wire::message::{NackEntry, ReportEntry};
@@ -119,7 +119,7 @@ struct Stream {
 struct Mirror {
     writer: RawWriter,
     newest: (Epoch, Seq),
-    /// Who sent that: another stream of the same life goes on where it ended.
+    /// Who sent that.
     from: Option<Tag>,
     /// Samples of the epoch that the source did not send: what a reader here cannot know otherwise.
     passed: Passed,
@@ -300,8 +300,8 @@ impl State {
             } => {
                 let now = ddx_store::now();
                 let held = self.inbound.mirrors.get(&mirror);
-                let after = held.and_then(|held| held.until(tag));
-                self.receiver.resume(tag, stream, &contract, after, now);
+                let held = held.and_then(Mirror::held);
+                self.receiver.resume(tag, stream, &contract, held, now);
                 let fresh = Stream {
                     mirror,
                     counts: Mirrored::default(),
@@ -433,14 +433,10 @@ impl Inbound {
 }
 
 impl Mirror {
-    /// Where another stream goes on. Of another life than the last one's all is new, from its beginning.
-    fn until(&self, tag: Tag) -> Option<(Epoch, Seq)> {
-        let from = self.from?;
-        Some(if from == tag {
-            self.newest
-        } else {
-            (Epoch(0), Seq(0))
-        })
+    /// What another stream of the item goes on from.
+    fn held(&self) -> Option<Held> {
+        let newest = self.newest;
+        self.from.map(|from| Held { from, newest })
     }
 
     fn take(&mut self, sample: &Received<'_>, clock: Option<&ClockOffset>, now: Time) -> Fate {

@@ -9,29 +9,17 @@ use ddx_rig::link::Profile;
 use ddx_rig::sim::{Host, Link, Random, Setup, Sim, Told};
 use ddx_wire::{Contract, Delivery, ItemName, Priority, Seq};
 
+use super::fleet::{Fleet, Source};
 use super::{check, ensure, millis, secs, seeds};
-
-/// One item, who writes it and how.
-struct Source {
-    host: usize,
-    rest: String,
-    name: ItemName,
-    period: Duration,
-    lens: [usize; 3],
-    next: Duration,
-}
 
 /// A scenario on its way.
 struct Play {
     random: Random,
-    sim: Sim,
+    fleet: Fleet,
     networks: usize,
     link: Link,
-    sources: Vec<Source>,
     /// A few, so that readers share streams.
     contracts: [Contract; 3],
-    ordinals: Vec<u32>,
-    on: Vec<bool>,
     /// Readers that have wanted each sample since they were opened.
     every: BTreeSet<(usize, ItemName)>,
     /// No fault happens and no datagram is lost.
@@ -81,6 +69,7 @@ impl Play {
             link,
             networks,
             beacon: random.chance(0.7),
+            multicast: true,
             drift_ppm: u32::try_from(random.below(100)).unwrap(),
             lag: chaos(&mut random, &[0, 200, 1_500]),
         });
@@ -99,17 +88,14 @@ impl Play {
             }
         }
         let mut play = Self {
-            sim,
+            fleet: Fleet::new(sim, hosts),
             networks,
             link,
-            sources: Vec::new(),
             contracts: [
                 contract(&mut random),
                 contract(&mut random),
                 contract(&mut random),
             ],
-            ordinals: vec![1; hosts],
-            on: vec![true; hosts],
             every: BTreeSet::new(),
             calm,
             whole,
@@ -126,20 +112,20 @@ impl Play {
     }
 
     fn add_source(&mut self) {
-        let host = self.random.index(self.on.len());
-        let rest = format!("i{}", self.sources.len());
-        let name = self.sim.announce(host, &rest);
+        let host = self.random.index(self.fleet.on.len());
+        let rest = format!("i{}", self.fleet.sources.len());
+        let name = self.fleet.sim.announce(host, &rest);
         let most = self.random.pick(&[48, 1_100, 1_300, 8_000, 30_000]);
         let mut len = || 48 + self.random.index(most);
-        let lens = [len(), len(), len()];
+        let lens = vec![len(), len(), len()];
         let least = if most > 4_000 { 60 } else { 4 };
-        self.sources.push(Source {
+        self.fleet.sources.push(Source {
             host,
             rest,
             name,
             period: millis(least + self.random.below(100)),
             lens,
-            next: self.sim.now(),
+            next: self.fleet.sim.now(),
         });
     }
 
@@ -158,44 +144,42 @@ impl Play {
         self.repair();
         self.run_for(secs(4))?;
         // What is lost at last is repeated, and what lacks is repaired or given up: after 5 s, or 16 round trips.
-        self.sim.run_for(secs(9));
-        for writer in 0..self.on.len() {
+        self.fleet.sim.run_for(secs(9));
+        for writer in 0..self.fleet.on.len() {
             self.balanced(writer)?;
         }
-        for reader in 0..self.on.len() {
+        for reader in 0..self.fleet.on.len() {
             self.told(reader)?;
         }
-        check(&self.sim)
+        check(&self.fleet.sim)
     }
 
     /// Lets time pass while programs write. The books of each moment balance.
     fn run_for(&mut self, span: Duration) -> Result<(), String> {
-        let end = self.sim.now() + span;
-        loop {
-            let next = self.sources.iter_mut().min_by_key(|source| source.next);
-            let Some(source) = next.filter(|source| source.next < end) else {
-                break;
-            };
-            let now = self.sim.now();
-            self.sim.run_for(source.next.saturating_sub(now));
-            source.next = source.next.max(now) + source.period;
-            let len = self.random.pick(&source.lens);
-            self.sim.write(source.host, &source.name, len);
-            accounted(&self.sim, source.host)?;
+        let end = self.fleet.sim.now() + span;
+        while let Some(source) = self.fleet.next_write(end) {
+            let Source {
+                host, name, lens, ..
+            } = &self.fleet.sources[source];
+            let len = self.random.pick(lens);
+            self.fleet.sim.write(*host, name, len);
+            accounted(&self.fleet.sim, *host)?;
         }
-        self.sim.run_for(end.saturating_sub(self.sim.now()));
         Ok(())
     }
 
     /// Some host opens, changes or closes a reader.
     fn change_reader(&mut self) {
-        let reader = self.random.index(self.on.len());
-        let source = self.random.index(self.sources.len());
-        let (host, name) = (self.sources[source].host, self.sources[source].name.clone());
-        if host == reader || !self.on[reader] {
+        let reader = self.random.index(self.fleet.on.len());
+        let source = self.random.index(self.fleet.sources.len());
+        let (host, name) = (
+            self.fleet.sources[source].host,
+            self.fleet.sources[source].name.clone(),
+        );
+        if host == reader || !self.fleet.on[reader] {
             return;
         }
-        let is_open = self.sim.host(reader).wanted.contains_key(&name);
+        let is_open = self.fleet.sim.host(reader).wanted.contains_key(&name);
         let at = (reader, name.clone());
         if self.random.chance(0.8) {
             let contract = self.random.pick(&self.contracts);
@@ -203,16 +187,16 @@ impl Play {
                 Delivery::Latest => self.every.remove(&at),
                 Delivery::Every | Delivery::EveryFromRing => !is_open && self.every.insert(at),
             };
-            self.sim.subscribe(reader, &name, contract);
+            self.fleet.sim.subscribe(reader, &name, contract);
         } else {
             self.every.remove(&at);
-            self.sim.unsubscribe(reader, &name);
+            self.fleet.sim.unsubscribe(reader, &name);
         }
     }
 
     fn disturb(&mut self) {
         let (host, network) = (
-            self.random.index(self.on.len()),
+            self.random.index(self.fleet.on.len()),
             self.random.index(self.networks),
         );
         let fault = match self.random.below(10) {
@@ -221,74 +205,54 @@ impl Play {
             fault => fault,
         };
         match fault {
-            0 if self.on[host] => {
-                self.on[host] = false;
+            0 if self.fleet.on[host] => {
                 self.every.retain(|(reader, _)| *reader != host);
-                self.sim.kill(host);
+                self.fleet.kill(host);
             }
             0 | 1 => self.restart(host),
-            2 => {
-                let sides: Vec<usize> = self.on.iter().map(|_| self.random.index(2)).collect();
-                self.sim.cut(|host| sides[host]);
-            }
-            3 => self.sim.heal(),
-            4 => self.sim.host_mut(host).hears_groups ^= true,
+            2 => self.fleet.cut(&mut self.random),
+            3 => self.fleet.sim.heal(),
+            4 => self.fleet.sim.host_mut(host).hears_groups ^= true,
             5 => {
-                let source = self.random.index(self.sources.len());
-                self.replace_writer(source);
+                let source = self.random.index(self.fleet.sources.len());
+                self.fleet.replace_writer(source);
             }
             6 if self.networks > 1 => {
                 let silent = self.random.chance(0.5);
-                self.sim.silence(host, network, silent);
+                self.fleet.sim.silence(host, network, silent);
             }
             7 => {
                 let loss = self.random.pick(&[0.0, 0.05, 0.3]);
                 let link = Link { loss, ..self.link };
-                self.sim.set_link(link);
+                self.fleet.sim.set_link(link);
             }
             _ => {}
         }
     }
 
-    fn replace_writer(&mut self, source: usize) {
-        let Source { host, rest, .. } = &self.sources[source];
-        if self.on[*host] {
-            self.sim.announce(*host, rest);
-        }
-    }
-
-    /// Ends a life of a host, if it has one, and begins the next: its writers come back with it.
+    /// The readers of a host go with its life.
     fn restart(&mut self, host: usize) {
-        self.on[host] = true;
-        self.ordinals[host] += 1;
         self.every.retain(|(reader, _)| *reader != host);
-        self.sim.start(host, self.ordinals[host]);
-        let again = self.sources.iter().filter(|source| source.host == host);
-        for rest in again.map(|source| source.rest.clone()).collect::<Vec<_>>() {
-            self.sim.announce(host, &rest);
-        }
+        self.fleet.restart(host);
     }
 
     /// Undoes all disturbances but deaf networks, which are none.
     fn repair(&mut self) {
-        self.sim.heal();
-        for host in 0..self.on.len() {
-            if !self.on[host] {
-                self.restart(host);
-            }
+        self.fleet.repair();
+        for host in 0..self.fleet.on.len() {
             for network in 0..self.networks {
-                self.sim.silence(host, network, false);
+                self.fleet.sim.silence(host, network, false);
             }
         }
-        for _ in 0..self.on.len() {
+        for _ in 0..self.fleet.on.len() {
             self.change_reader();
         }
     }
 
     /// At rest: what a host sends, before and behind each way, and what its readers say of the same way.
     fn balanced(&self, writer: usize) -> Result<(), String> {
-        accounted(&self.sim, writer)?;
-        let host = self.sim.host(writer);
+        accounted(&self.fleet.sim, writer)?;
+        let host = self.fleet.sim.host(writer);
         let tag = host.catalog.as_ref().unwrap().tag();
         let sources = host.source_books();
         for (id, to, sent) in host.sent_books() {
@@ -327,7 +291,7 @@ impl Play {
                 continue;
             }
             for reader in route.readers.iter().filter(|r| by(r.via, r.addr)) {
-                let hosts = (0..self.on.len()).map(|index| self.sim.host(index));
+                let hosts = (0..self.fleet.on.len()).map(|index| self.fleet.sim.host(index));
                 let is_reader = |host: &&Host| {
                     let catalog = host.catalog.as_ref();
                     catalog.is_some_and(|catalog| catalog.tag() == reader.tag)
@@ -351,10 +315,10 @@ impl Play {
 
     /// At rest: what the readers of a host were told.
     fn told(&self, reader: usize) -> Result<(), String> {
-        let host = self.sim.host(reader);
+        let host = self.fleet.sim.host(reader);
         for (name, contract) in &host.wanted {
-            let source = self.sources.iter().find(|s| s.name == *name).unwrap();
-            let newest = self.sim.host(source.host).newest(name);
+            let source = self.fleet.sources.iter().find(|s| s.name == *name).unwrap();
+            let newest = self.fleet.sim.host(source.host).newest(name);
             let Some((told, books)) = host.told(name).filter(|(told, _)| told.delivered > 0) else {
                 continue;
             };
@@ -390,13 +354,13 @@ impl Play {
     fn describe(&self) -> String {
         format!(
             "{} hosts on {} networks, {:?}, calm {}, whole {}, limited {}, at {:?}",
-            self.on.len(),
+            self.fleet.on.len(),
             self.networks,
             self.link,
             self.calm,
             self.whole,
             self.limited,
-            self.sim.now()
+            self.fleet.sim.now()
         )
     }
 }

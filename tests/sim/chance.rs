@@ -7,29 +7,17 @@ use ddx_rig::link::Profile;
 use ddx_rig::sim::{Link, Random, Setup, Sim};
 use ddx_wire::{Contract, ItemName};
 
+use super::fleet::{Fleet, Source};
 use super::{check, ensure, millis, secs, seeds};
-
-/// One item, who writes it and how.
-struct Source {
-    host: usize,
-    rest: String,
-    name: ItemName,
-    period: Duration,
-    len: usize,
-    next: Duration,
-}
 
 /// A scenario on its way.
 struct Play {
     seed: u64,
     random: Random,
-    sim: Sim,
+    fleet: Fleet,
     loss: f64,
     /// What the slowest link carries, bits per second, where links are limited at all.
     rate: Option<u64>,
-    sources: Vec<Source>,
-    ordinals: Vec<u32>,
-    on: Vec<bool>,
     /// Nothing but writing and reading: counts are exact.
     calm: bool,
 }
@@ -57,12 +45,12 @@ fn play(seed: u64) -> Result<(), String> {
     play.ends_with_the_newest("after the last write")?;
     play.exact()?;
     if !play.calm {
-        play.cut();
+        play.fleet.cut(&mut play.random);
         let span = millis(200 + play.random.below(13_000));
         play.run_for(span);
-        play.sim.heal();
+        play.fleet.sim.heal();
         // Hosts that lost each other meet anew first: at high loss that takes several tries.
-        play.sim.run_for(if play.loss > 0.1 {
+        play.fleet.sim.run_for(if play.loss > 0.1 {
             secs(5)
         } else {
             Duration::ZERO
@@ -70,7 +58,7 @@ fn play(seed: u64) -> Result<(), String> {
         play.ends_with_the_newest("after the heal")?;
     }
     play.silence()?;
-    check(&play.sim).map_err(|text| format!("{}: {text}", play.describe()))
+    check(&play.fleet.sim).map_err(|text| format!("{}: {text}", play.describe()))
 }
 
 impl Play {
@@ -100,6 +88,7 @@ impl Play {
             link,
             networks: 1,
             beacon: random.chance(0.7),
+            multicast: true,
             drift_ppm: u32::try_from(random.below(100)).unwrap(),
             lag: if calm {
                 Duration::ZERO
@@ -112,24 +101,21 @@ impl Play {
             .then(|| Self::limit_links(&mut sim, hosts, seed, &mut random));
         let mut play = Self {
             seed,
-            sim,
+            fleet: Fleet::new(sim, hosts),
             loss,
             rate,
-            sources: Vec::new(),
-            ordinals: vec![1; hosts],
-            on: vec![true; hosts],
             calm,
             random,
         };
         for host in 0..hosts {
             for item in 0..1 + play.random.below(3) {
                 let rest = format!("i{item}");
-                let name = play.sim.announce(host, &rest);
+                let name = play.fleet.sim.announce(host, &rest);
                 let period = millis(play.random.pick(&[5, 20, 50, 110, 700]));
                 let len = play
                     .random
                     .pick(&[48, 200, 1_100, 1_200, 5_000, 5_000, 40_000]);
-                play.sources.push(Source {
+                play.fleet.sources.push(Source {
                     host,
                     rest,
                     name,
@@ -138,8 +124,8 @@ impl Play {
                     } else {
                         period
                     },
-                    len,
-                    next: play.sim.now(),
+                    lens: vec![len],
+                    next: play.fleet.sim.now(),
                 });
             }
         }
@@ -174,10 +160,15 @@ impl Play {
         let Some(rate) = self.rate else {
             return Duration::ZERO;
         };
-        let wanted = (0..self.on.len()).flat_map(|reader| self.sim.host(reader).wanted.keys());
+        let wanted =
+            (0..self.fleet.on.len()).flat_map(|reader| self.fleet.sim.host(reader).wanted.keys());
         let lens = wanted.filter_map(|name| {
-            let source = self.sources.iter().find(|source| source.name == *name);
-            source.map(|source| source.len)
+            let source = self
+                .fleet
+                .sources
+                .iter()
+                .find(|source| source.name == *name);
+            source.map(|source| source.lens[0])
         });
         let bits = u64::try_from(lens.sum::<usize>() * 8).unwrap();
         millis(8 * bits * 1_000 / rate)
@@ -186,28 +177,23 @@ impl Play {
     fn describe(&self) -> String {
         format!(
             "{} hosts, loss {}, rate {:?}, calm {}, at {:?}",
-            self.on.len(),
+            self.fleet.on.len(),
             self.loss,
             self.rate,
             self.calm,
-            self.sim.now()
+            self.fleet.sim.now()
         )
     }
 
     /// Lets time pass while programs write.
     fn run_for(&mut self, span: Duration) {
-        let end = self.sim.now() + span;
-        loop {
-            let next = self.sources.iter_mut().min_by_key(|source| source.next);
-            let Some(source) = next.filter(|source| source.next < end) else {
-                break;
-            };
-            let now = self.sim.now();
-            self.sim.run_for(source.next.saturating_sub(now));
-            source.next = source.next.max(now) + source.period;
-            self.sim.write(source.host, &source.name, source.len);
+        let end = self.fleet.sim.now() + span;
+        while let Some(source) = self.fleet.next_write(end) {
+            let Source {
+                host, name, lens, ..
+            } = &self.fleet.sources[source];
+            self.fleet.sim.write(*host, name, lens[0]);
         }
-        self.sim.run_for(end.saturating_sub(self.sim.now()));
     }
 
     fn contract(&mut self) -> Contract {
@@ -217,89 +203,58 @@ impl Play {
 
     /// Some host opens, changes or closes a reader.
     fn change_reader(&mut self) {
-        let reader = self.random.index(self.on.len());
-        let source = self.random.index(self.sources.len());
-        let source = &self.sources[source];
+        let reader = self.random.index(self.fleet.on.len());
+        let source = self.random.index(self.fleet.sources.len());
+        let source = &self.fleet.sources[source];
         let name = source.name.clone();
         if source.host == reader {
             return;
         }
         if self.random.chance(0.75) {
             let contract = self.contract();
-            self.sim.subscribe(reader, &name, contract);
+            self.fleet.sim.subscribe(reader, &name, contract);
         } else {
-            self.sim.unsubscribe(reader, &name);
+            self.fleet.sim.unsubscribe(reader, &name);
         }
     }
 
     fn disturb(&mut self) {
-        let host = self.random.index(self.on.len());
+        let host = self.random.index(self.fleet.on.len());
         match self.random.below(9) {
-            0 if self.on[host] => {
-                self.on[host] = false;
-                self.sim.kill(host);
-            }
-            0 | 1 => self.restart(host),
-            2 => self.cut(),
-            3 | 4 => self.sim.heal(),
-            5 => self.sim.host_mut(host).hears_groups ^= true,
+            0 if self.fleet.on[host] => self.fleet.kill(host),
+            0 | 1 => self.fleet.restart(host),
+            2 => self.fleet.cut(&mut self.random),
+            3 | 4 => self.fleet.sim.heal(),
+            5 => self.fleet.sim.host_mut(host).hears_groups ^= true,
             6 => {
-                let source = self.random.index(self.sources.len());
+                let source = self.random.index(self.fleet.sources.len());
                 let Source {
-                    host, name, len, ..
-                } = &self.sources[source];
+                    host, name, lens, ..
+                } = &self.fleet.sources[source];
                 // The last of one writer and the first of the next may overtake each other.
-                self.sim.write(*host, name, *len);
-                self.replace_writer(source);
-                self.sources[source].next = self.sim.now();
+                self.fleet.sim.write(*host, name, lens[0]);
+                self.fleet.replace_writer(source);
+                self.fleet.sources[source].next = self.fleet.sim.now();
             }
             7 => {
-                let source = self.random.index(self.sources.len());
-                let Source { host, name, .. } = &self.sources[source];
-                self.sim.withdraw(*host, name);
+                let source = self.random.index(self.fleet.sources.len());
+                let Source { host, name, .. } = &self.fleet.sources[source];
+                self.fleet.sim.withdraw(*host, name);
             }
             _ => {}
         }
     }
 
-    fn replace_writer(&mut self, source: usize) {
-        let Source { host, rest, .. } = &self.sources[source];
-        if self.on[*host] {
-            self.sim.announce(*host, rest);
-        }
-    }
-
-    fn cut(&mut self) {
-        let sides: Vec<usize> = (0..self.on.len()).map(|_| self.random.index(2)).collect();
-        self.sim.cut(|host| sides[host]);
-    }
-
-    /// Ends a life of a host, if it has one, and begins the next: its programs come back with it.
-    fn restart(&mut self, host: usize) {
-        self.on[host] = true;
-        self.ordinals[host] += 1;
-        self.sim.start(host, self.ordinals[host]);
-        let again = self.sources.iter().filter(|source| source.host == host);
-        for source in again.map(|source| source.rest.clone()).collect::<Vec<_>>() {
-            self.sim.announce(host, &source);
-        }
-    }
-
     /// Undoes all disturbances but deaf networks, which are none.
     fn repair(&mut self) {
-        self.sim.heal();
-        for host in 0..self.on.len() {
-            if !self.on[host] {
-                self.restart(host);
+        self.fleet.repair();
+        for source in 0..self.fleet.sources.len() {
+            let Source { host, name, .. } = &self.fleet.sources[source];
+            if self.fleet.sim.host(*host).newest(name).is_none() {
+                self.fleet.replace_writer(source);
             }
         }
-        for source in 0..self.sources.len() {
-            let Source { host, name, .. } = &self.sources[source];
-            if self.sim.host(*host).newest(name).is_none() {
-                self.replace_writer(source);
-            }
-        }
-        for _ in 0..self.on.len() {
+        for _ in 0..self.fleet.on.len() {
             self.change_reader();
         }
     }
@@ -307,19 +262,19 @@ impl Play {
     /// One second after now, without writes, every reader holds the newest value. Where links are limited, a path that
     /// had little of one first finds that it is alone there now, and the value takes its time to cross.
     fn ends_with_the_newest(&mut self, when: &str) -> Result<(), String> {
-        let start = self.sim.now();
+        let start = self.fleet.sim.now();
         let found = self.rate.map_or(Duration::ZERO, |_| secs(1));
-        self.sim.run_for(secs(1) + found + self.crossing());
-        for reader in 0..self.on.len() {
-            for (name, contract) in &self.sim.host(reader).wanted {
-                let mut sources = self.sources.iter();
-                let Source { host, len, .. } = sources.find(|s| s.name == *name).unwrap();
-                let newest = self.sim.host(*host).newest(name);
-                let held = self.sim.host(reader).held(name);
+        self.fleet.sim.run_for(secs(1) + found + self.crossing());
+        for reader in 0..self.fleet.on.len() {
+            for (name, contract) in &self.fleet.sim.host(reader).wanted {
+                let mut sources = self.fleet.sources.iter();
+                let Source { host, lens, .. } = sources.find(|s| s.name == *name).unwrap();
+                let newest = self.fleet.sim.host(*host).newest(name);
+                let held = self.fleet.sim.host(reader).held(name);
                 // Under a contract the newest may have to wait for its turn.
                 if held != newest && contract.max_rate_mhz.is_none_or(|mhz| mhz > 5_000) {
                     return Err(format!(
-                        "{}: host {reader} holds {held:?} of `{name}`, {len} bytes, {when} at {start:?}, which is at {newest:?}",
+                        "{}: host {reader} holds {held:?} of `{name}`, {lens:?} bytes, {when} at {start:?}, which is at {newest:?}",
                         self.describe()
                     ));
                 }
@@ -333,8 +288,8 @@ impl Play {
         if !self.calm {
             return Ok(());
         }
-        for index in 0..self.on.len() {
-            let host = self.sim.host(index);
+        for index in 0..self.fleet.on.len() {
+            let host = self.fleet.sim.host(index);
             let lost = host.link_lost();
             ensure(lost == 0, || format!("{}: {lost} lost", self.describe()))?;
         }
@@ -343,10 +298,11 @@ impl Play {
 
     /// When the last reader closes, sending ends.
     fn silence(&mut self) -> Result<(), String> {
-        for reader in 0..self.on.len() {
-            let names: BTreeSet<ItemName> = self.sim.host(reader).wanted.keys().cloned().collect();
+        for reader in 0..self.fleet.on.len() {
+            let names: BTreeSet<ItemName> =
+                self.fleet.sim.host(reader).wanted.keys().cloned().collect();
             for name in names {
-                self.sim.unsubscribe(reader, &name);
+                self.fleet.sim.unsubscribe(reader, &name);
             }
         }
         // Without loss a goodbye arrives; else it is said three times, and the lease ends what nobody heard.
@@ -355,13 +311,13 @@ impl Play {
         } else {
             millis(3_400)
         };
-        self.sim.run_for(limit);
-        let before: u64 = (0..self.on.len())
-            .map(|i| self.sim.host(i).sent().datagrams)
+        self.fleet.sim.run_for(limit);
+        let before: u64 = (0..self.fleet.on.len())
+            .map(|i| self.fleet.sim.host(i).sent().datagrams)
             .sum();
         self.run_for(secs(1));
-        let after: u64 = (0..self.on.len())
-            .map(|i| self.sim.host(i).sent().datagrams)
+        let after: u64 = (0..self.fleet.on.len())
+            .map(|i| self.fleet.sim.host(i).sent().datagrams)
             .sum();
         ensure(before == after, || {
             format!(

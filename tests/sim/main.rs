@@ -23,6 +23,7 @@ mod books;
 mod chance;
 mod delivery;
 mod directory;
+mod fleet;
 mod links;
 mod matrix;
 mod paths;

@@ -14,17 +14,18 @@ use super::{check, millis, secs};
 
 /// Hosts on links that do nothing but what a profile says.
 fn quiet(seed: u64, hosts: usize) -> Sim {
-    let link = Link {
-        loss: 0.0,
-        duplicates: 0.0,
-        delay: Duration::ZERO,
-        jitter: Duration::ZERO,
-    };
     Sim::new(Setup {
-        link,
+        link: STILL,
         ..Setup::lan(seed, hosts, 0.0)
     })
 }
+
+const STILL: Link = Link {
+    loss: 0.0,
+    duplicates: 0.0,
+    delay: Duration::ZERO,
+    jitter: Duration::ZERO,
+};
 
 fn profile(text: &str) -> Profile {
     Profile::parse(text).unwrap()
@@ -409,6 +410,37 @@ fn a_group_that_loses_is_left_and_found_again() {
     // The trials that failed, after 5, 10 and 20 s, make the next one wait up to 40 s.
     assert!(play.sim.now() < start + secs(45));
     check(&play.sim).unwrap();
+}
+
+/// More than the links carry, to two readers.
+#[test]
+fn broken_multicast_costs_no_more_than_a_tenth_of_what_unicast_carries() {
+    let carried = [true, false].map(|multicast| {
+        let mut sim = Sim::new(Setup {
+            multicast,
+            link: STILL,
+            ..Setup::lan(9, 3, 0.0)
+        });
+        for reader in [1, 2] {
+            let broken = format!("wifi-multicast-broken --seed {reader}");
+            sim.set_profile(reader, 0, &profile(&broken));
+        }
+        let mut play = Play::new(sim);
+        let source = play.source("cam", 8_000, millis(1));
+        for reader in [1, 2] {
+            play.read(source, reader, Contract::default());
+        }
+        play.run_for(secs(10));
+        play.forget();
+        // Trials of the group, and what these cost, are in it.
+        play.run_for(secs(60));
+        let samples = [1, 2].map(|reader| play.seen[&(source, reader)].samples);
+        println!("multicast {multicast}: {samples:?} of 60000");
+        check(&play.sim).unwrap();
+        samples.into_iter().min().unwrap()
+    });
+    assert!(carried[0] * 10 >= carried[1] * 9, "{carried:?}");
+    assert!(carried[1] * 8_000 * 8 / 60 > 30_000_000, "{carried:?}");
 }
 
 /// Robots that send to one ground station cannot see each other.

@@ -54,6 +54,16 @@ pub(super) struct Congestion {
     before_silence: Option<f64>,
     /// What arrives of this sender, as a multiple of the mean of all that share the path.
     share: f64,
+    /// What was known, and when, as another path was tried in place of this one.
+    left: Option<(Known, Time)>,
+}
+
+/// What is known of a path.
+#[derive(Clone, Copy, Debug)]
+struct Known {
+    bytes_per_second: f64,
+    ceiling: Option<f64>,
+    ceiling_share: f64,
 }
 
 impl Congestion {
@@ -79,6 +89,31 @@ impl Congestion {
             grown_at: now,
             before_silence: None,
             share: 1.0,
+            left: None,
+        }
+    }
+
+    /// Notes that another path is tried, which may fill this one.
+    pub(super) fn leave(&mut self, now: Time) {
+        let known = Known {
+            bytes_per_second: self.bytes_per_second,
+            ceiling: self.ceiling,
+            ceiling_share: self.ceiling_share,
+        };
+        self.left.get_or_insert((known, now));
+    }
+
+    /// Notes that the other path was given up. What it did to this one is no news of what this one carries.
+    pub(super) fn come_back(&mut self, now: Time) {
+        if let Some((known, since)) = self.left.take()
+            && now.since(since) < TRIAL_MAX
+        {
+            self.bytes_per_second = known.bytes_per_second;
+            (self.ceiling, self.ceiling_share) = (known.ceiling, known.ceiling_share);
+            (self.slowed_at, self.grown_at) = (now, now);
+            // What has piled up is to drain first.
+            self.slowed_until = now + DRAIN_MAX;
+            self.arrived.clear();
         }
     }
 
@@ -194,7 +229,7 @@ impl Congestion {
                 self.ceiling = Some(ceiling * self.share / self.ceiling_share);
                 self.ceiling_share = self.share;
             }
-            if self.queue > low {
+            if self.queue > low && now >= self.slowed_until {
                 self.draw_back(capacity, seen_after, now);
             } else if self.limited && now >= self.grown_at.max(self.slowed_at) + seen_after {
                 self.grow(capacity, seen_after, now);
@@ -425,6 +460,8 @@ const JITTER_FIRST: Duration = Duration::from_millis(1);
 /// How long what has piled up may take to drain: some of the times that it takes to see that.
 const DRAIN_MIN: Duration = Duration::from_millis(50);
 const DRAIN_MAX: Duration = Duration::from_millis(300);
+/// How long another path may be tried: what was known before is too old then.
+const TRIAL_MAX: Duration = Duration::from_secs(5);
 /// Share of what the path carries at which the rate stays.
 const STAY: f64 = 0.95;
 /// Share of what is sent that arrives where the path carries all of it.

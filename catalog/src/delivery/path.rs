@@ -499,6 +499,16 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         queued.into_iter().chain(waiting).min()
     }
 
+    /// Notes that a group is tried in place of this path, or beside it.
+    pub(super) fn leave(&mut self, now: Time) {
+        self.congestion.leave(now);
+    }
+
+    /// Notes that the group was given up.
+    pub(super) fn come_back(&mut self, now: Time) {
+        self.congestion.come_back(now);
+    }
+
     /// Seals the next batch into `out`.
     pub(super) fn poll_transmit(
         &mut self,

@@ -16,7 +16,7 @@ use super::early::Early;
 use super::order::{Next, Order, Why, cost, is_later_epoch};
 use super::reassembly::{Due, Place, Reassembly, Rules};
 use super::reception::Reception;
-use super::{Passed, Received, ReceiverEvent, TimerName, key};
+use super::{Held, Passed, Received, ReceiverEvent, TimerName, key};
 
 /// Identity and limits of a [`Receiver`].
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -170,20 +170,24 @@ impl Receiver {
         self.resume(tag, stream, contract, None, now);
     }
 
-    /// The same for one that goes on where another stream of the same item ended: with what follows the sample `after`. Epoch
-    /// and number 0 are before all that another life of its owner has.
+    /// The same where samples of the item are here already: it goes on with what follows the newest of them. Of another
+    /// life of the owner than that one's all is new, from its beginning. Returns after which sample it goes on, if any.
     pub fn resume(
         &mut self,
         tag: Tag,
         stream: StreamId,
         contract: &Contract,
-        after: Option<(Epoch, Seq)>,
+        held: Option<Held>,
         now: Time,
-    ) {
+    ) -> Option<(Epoch, Seq)> {
+        let after = held.map(|held| match held.from == tag {
+            true => held.newest,
+            false => (Epoch(0), Seq(0)),
+        });
         let known = self.streams.contains_key(&(tag, stream));
         if !known && self.streams.len() >= self.config.max_streams {
             self.counters.refused_streams += 1;
-            return;
+            return after;
         }
         self.streams.entry((tag, stream)).or_insert_with(|| {
             let mut fresh = Stream {
@@ -210,6 +214,7 @@ impl Receiver {
                 self.take(tag, &record, false, now);
             }
         }
+        after
     }
 
     /// Expects a stream no more, and forgets its order and its books.

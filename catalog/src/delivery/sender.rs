@@ -139,7 +139,15 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
             full: false,
         });
         let before = std::mem::take(&mut stream.destinations);
+        let alone = |stream: &Stream| -> BTreeMap<SocketAddr, bool> {
+            let readers = stream.readers.iter().map(|reader| &reader.host);
+            readers
+                .map(|host| (host.addr, host.via == Via::Unicast))
+                .collect()
+        };
+        let alone_before = alone(stream);
         let left_out = stream.reroute(route, now);
+        let alone_now = alone(stream);
         self.counters.refused_readers += left_out;
         let contract = stream.contract;
         let destinations = stream.destinations.clone();
@@ -168,6 +176,16 @@ impl<P: AsRef<[u8]> + Clone> Sender<P> {
         for to in before.into_iter().filter(|to| !destinations.contains(to)) {
             if let Some(path) = self.paths.get_mut(&to) {
                 path.rest(id);
+            }
+        }
+        for (to, was_alone) in alone_before {
+            let Some(path) = self.paths.get_mut(&to) else {
+                continue;
+            };
+            match (was_alone, alone_now.get(&to)) {
+                (true, Some(false)) => path.leave(now),
+                (false, Some(true)) => path.come_back(now),
+                _ => {}
             }
         }
         for to in wanting {

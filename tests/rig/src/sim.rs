@@ -51,6 +51,8 @@ pub struct Setup {
     pub networks: usize,
     /// Whether beacons reach everybody; else all hosts have the first as a seed.
     pub beacon: bool,
+    /// Whether samples may travel by multicast.
+    pub multicast: bool,
     /// Greatest drift of a clock, parts per million, either way.
     pub drift_ppm: u32,
     /// How long an order or a notice waits between two threads of a host, at most.
@@ -118,6 +120,7 @@ impl Setup {
             link: Link::lan(loss),
             networks: 1,
             beacon: true,
+            multicast: true,
             drift_ppm: 90,
             lag: Duration::ZERO,
         }
@@ -188,7 +191,7 @@ impl Sim {
             data_port: DATA_PORT,
             seeds,
             beacon: self.setup.beacon,
-            multicast: true,
+            multicast: self.setup.multicast,
             prefix_since: now.local,
         };
         self.tags

@@ -33,8 +33,11 @@ fn run(seed: u64, pause: u64) -> Run {
     let mut receiver = receiver();
     receiver.forget(sender_tag(), STREAM);
     // The samples before the first were held of another stream.
-    let before = Some((Epoch(1), Seq(0)));
-    receiver.resume(sender_tag(), STREAM, &contract, before, Time(0));
+    let held = Held {
+        from: sender_tag(),
+        newest: (Epoch(1), Seq(0)),
+    };
+    receiver.resume(sender_tag(), STREAM, &contract, Some(held), Time(0));
     let mut run = Run {
         random: seed,
         delivered: BTreeSet::new(),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ddx_catalog::delivery::{Books, Passed, Received, Receiver, ReceiverConfig};
+use ddx_catalog::delivery::{Books, Held, Passed, Received, Receiver, ReceiverConfig};
 use ddx_wire::seal::KeyId;
 use ddx_wire::{ClockOffset, Contract, Epoch, ItemName, Seq, StreamId, Tag, Time};
 
@@ -32,7 +32,7 @@ pub(super) struct Rx {
 pub(super) struct Mirror {
     pub(super) name: ItemName,
     pub(super) newest: (Epoch, Seq),
-    /// Who sent that: another stream of the same life goes on where it ended.
+    /// Who sent that.
     from: Option<Tag>,
     /// Samples of the epoch that the source did not send, as the mirror's stamps say.
     passed: Passed,
@@ -94,8 +94,8 @@ impl Rx {
         now: Time,
     ) {
         let held = self.mirrors.get(&mirror);
-        let after = held.and_then(|held| held.until(tag));
-        self.receiver.resume(tag, stream, contract, after, now);
+        let held = held.and_then(Mirror::held);
+        let after = self.receiver.resume(tag, stream, contract, held, now);
         let fresh = Stream {
             mirror,
             newest: after,
@@ -275,14 +275,10 @@ impl Mirror {
         }
     }
 
-    /// Where another stream goes on, as in the daemon.
-    fn until(&self, tag: Tag) -> Option<(Epoch, Seq)> {
-        let from = self.from?;
-        Some(if from == tag {
-            self.newest
-        } else {
-            (Epoch(0), Seq(0))
-        })
+    /// What another stream of the item goes on from.
+    fn held(&self) -> Option<Held> {
+        let newest = self.newest;
+        self.from.map(|from| Held { from, newest })
     }
 
     /// Writes a sample, as the daemon does, and reads it, as the store does. `false` when the source claims more than there
