@@ -24,6 +24,7 @@ pub use ddx_wire::sample::SampleMeta;
 use ddx_wire::{Contract, Epoch, Seq, StreamId, Tag, Time};
 
 mod books;
+mod cauchy;
 mod congestion;
 mod deadlines;
 mod early;

@@ -1,12 +1,11 @@
 //! Forward error correction of a sample in fragments: parities, each of which stands in for any one fragment that is lost.
 //!
-//! Reed-Solomon over the field of 256, crate `reed-solomon-erasure`, in blocks: what follows one another in a sample lies in
-//! different blocks, so that a burst of losses is shared among them. A codec is made for each sample: that takes less than
-//! the sample does, and its cache of inverted matrices, which hardly ever meets one loss twice, cannot grow.
+//! A [Cauchy code](super::cauchy) in blocks: what follows one another in a sample lies in different blocks, so that a burst of
+//! losses is shared among them.
 
 use std::time::Duration;
 
-use reed_solomon_erasure::galois_8::ReedSolomon;
+use super::cauchy::{self, SHARDS_MAX};
 
 /// What decides whether parities pay.
 #[derive(Clone, Copy, Debug)]
@@ -22,8 +21,9 @@ pub(super) struct Link {
 impl Link {
     /// How many parities to add to a sample of `count` fragments of `step` bytes: 0 where repair on request is quick enough.
     ///
-    /// They are as many as will probably be lost, parities included, and two standard deviations of bursts more in each block. They pay
-    /// when what they take beyond the repairs that they save is less than a third of the time that these would take.
+    /// They are as many as will probably be lost, parities included, a standard deviation of bursts, and one in each block: of
+    /// what is lost by chance, one sample in some hundred is asked for. They pay when what they take beyond the repairs that
+    /// they save is less than a third of the time that these would take.
     pub(super) fn parities(&self, count: usize, step: usize) -> u8 {
         if self.loss_permille == 0 || !(2..=DATA_MAX).contains(&count) {
             return 0;
@@ -45,7 +45,7 @@ impl Link {
         for _ in 0..8 {
             let lost = loss * (count + parities);
             let spread = (2.0 * lost * blocks).sqrt();
-            parities = (lost + 2.0 * spread + blocks).ceil();
+            parities = (lost + spread + blocks).ceil();
         }
         // Requests until all is there: the first is made with the probability that anything is lost.
         let (mut missing, mut requests) = (count * loss, 0.0);
@@ -75,14 +75,11 @@ pub(super) fn encode(payload: &[u8], step: usize, parities: u8) -> Option<Vec<u8
     let blocks = Blocks::new(payload.len().div_ceil(step.max(1)), parities)?;
     let mut encoded = vec![0; parities * step];
     for block in 0..blocks.blocks {
-        let data: Vec<_> = blocks
-            .fragments(block)
-            .filter_map(|index| shard(payload, step, index))
-            .collect();
+        let shards = blocks.fragments(block);
+        let shards = shards.filter_map(|index| payload.chunks(step).nth(index));
         let parity = encoded.chunks_exact_mut(step).skip(block);
         let mut parity: Vec<_> = parity.step_by(blocks.blocks).collect();
-        let codec = ReedSolomon::new(data.len(), parity.len()).ok()?;
-        codec.encode_sep(&data, &mut parity).ok()?;
+        cauchy::encode(shards, &mut parity);
     }
     Some(encoded)
 }
@@ -104,23 +101,22 @@ pub(super) fn restore<'a>(
         if blocks.fragments(block).all(&has) {
             continue;
         }
-        let data = blocks.fragments(block).map(|index| {
-            let shard = has(index).then(|| shard(payload, step, index)).flatten();
-            shard.map(std::borrow::Cow::into_owned)
-        });
-        let parity = blocks
+        let of = blocks.fragments(block).enumerate();
+        let (there, missing): (Vec<_>, Vec<_>) = of.partition(|(_, index)| has(*index));
+        let shards = there
+            .iter()
+            .filter_map(|(i, index)| Some((*i, payload.chunks(step).nth(*index)?)));
+        let parities = blocks
             .parities(block)
-            .map(|index| Some(parity(index)?.to_vec()));
-        let mut shards: Vec<_> = data.chain(parity).collect();
-        let data = blocks.fragments(block).count();
-        let is_restored = ReedSolomon::new(data, shards.len() - data)
-            .and_then(|codec| codec.reconstruct_data(&mut shards))
-            .is_ok();
-        if !is_restored {
+            .enumerate()
+            .filter_map(|(j, index)| Some((j, parity(index)?)));
+        let numbers: Vec<usize> = missing.iter().map(|(i, _)| *i).collect();
+        let (shards, parities): (Vec<_>, Vec<_>) = (shards.collect(), parities.collect());
+        let Some(restored) = cauchy::restore(&numbers, &shards, &parities) else {
             return false;
-        }
-        for (index, shard) in blocks.fragments(block).zip(shards.into_iter().flatten()) {
-            if let Some(to) = payload.chunks_mut(step).nth(index)
+        };
+        for ((_, index), shard) in missing.iter().zip(restored) {
+            if let Some(to) = payload.chunks_mut(step).nth(*index)
                 && let Some(from) = shard.get(..to.len())
             {
                 to.copy_from_slice(from);
@@ -180,24 +176,10 @@ impl Blocks {
     }
 }
 
-/// A fragment, the last one filled up to the length of the others.
-fn shard(payload: &[u8], step: usize, index: usize) -> Option<std::borrow::Cow<'_, [u8]>> {
-    let shard = payload.chunks(step).nth(index)?;
-    Some(if shard.len() == step {
-        shard.into()
-    } else {
-        let mut shard = shard.to_vec();
-        shard.resize(step, 0);
-        shard.into()
-    })
-}
-
 /// `PROTOCOL.md#parities`: fragments of a sample that may have parities.
 const DATA_MAX: usize = 1_024;
-/// `PROTOCOL.md#parities`: fragments of a block at most. The time that a codec takes grows with the third power.
+/// `PROTOCOL.md#parities`: fragments of a block at most. The time that each parity takes grows with them.
 const BLOCK: usize = 64;
-/// What the field has room for: fragments and parities of one block.
-const SHARDS_MAX: usize = 256;
 /// More than this share cannot be made up for.
 const LOSS_MAX: f64 = 0.5;
 /// What a receiver waits before it makes a request, and what the answer waits before it leaves.

@@ -371,7 +371,9 @@ impl Partial {
 
     /// Restores the sample once enough is here.
     fn restore(&mut self) -> Added {
-        if self.parities.is_empty() || self.lacking() != Some(0) {
+        let here: usize = self.ranges.iter().map(|(start, end)| end - start).sum();
+        let may_do = here + self.parities.len() * self.step >= self.bytes.len();
+        if self.parities.is_empty() || !may_do || self.lacking() != Some(0) {
             return Added::Part;
         }
         let mut bytes = std::mem::take(&mut self.bytes);

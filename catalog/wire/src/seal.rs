@@ -267,7 +267,7 @@ mod tests {
         let shown: String = datagram.iter().map(|b| format!("{b:02x}")).collect();
         assert_eq!(
             shown,
-            "0203ba684d0000005b9f930c0e7a414f00000000000000009d84ff8b6f2dd00f68c69211bedb5dabb0603f"
+            "0303ba684d0000005b9f930c0e7a414f00000000000000009d84ff803e6932ffa541adf71b5d1ca78faa1c"
         );
     }
 
