@@ -16,6 +16,7 @@
 //! queue       datagrams that are about to leave          books       what became of each sample
 //! ```
 
+use std::borrow::Cow;
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -184,7 +185,7 @@ pub enum ReceiverEvent {
 }
 
 /// A sample that arrived whole, newer than any delivered before it on its stream.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received<'a> {
     /// The sender.
     pub tag: Tag,
@@ -192,8 +193,8 @@ pub struct Received<'a> {
     pub stream: StreamId,
     /// What is known of it; times are of the sender's clock.
     pub meta: SampleMeta,
-    /// Its bytes.
-    pub payload: &'a [u8],
+    /// Its bytes: those of a sample that came in fragments are the driver's.
+    pub payload: Cow<'a, [u8]>,
     /// What became at the source of the samples between this one and the one before; the others were lost.
     pub passed: Passed,
 }

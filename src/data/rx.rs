@@ -1,5 +1,6 @@
 //! The thread that receives samples: sockets in, mirrors out.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::net::UdpSocket;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -30,6 +31,8 @@ const PATIENCE: Duration = Duration::from_secs(1);
 const SLEEP_MAX: Duration = Duration::from_secs(1);
 /// Which of the two sockets is the one of multicast samples.
 const GROUP: usize = 1;
+/// Of a large sample so much is copied at a time: some 30 us.
+const PIECE_BYTES: usize = 128 << 10;
 /// Batches taken from one socket before the other gets its turn.
 const BATCHES_PER_TURN: usize = 8;
 
@@ -107,6 +110,8 @@ struct Inbound {
     streams: HashMap<(Tag, StreamId), Stream>,
     /// What is known of the senders' clocks, and since when.
     clocks: HashMap<Tag, (ClockOffset, Time)>,
+    /// Mirrors that a large sample is copied to.
+    copying: Vec<MirrorId>,
     traffic: Arc<Traffic>,
 }
 
@@ -123,11 +128,20 @@ struct Mirror {
     from: Option<Tag>,
     /// Samples of the epoch that the source did not send: what a reader here cannot know otherwise.
     passed: Passed,
+    copying: Option<Copying>,
+}
+
+/// A large sample on its way into the store, a piece at a time: others do not wait for it.
+struct Copying {
+    payload: Vec<u8>,
+    copied: usize,
+    origin: Origin,
 }
 
 /// Samples of one stream that come one after the other: what they have in common.
 struct Run<'a> {
     of: (Tag, StreamId),
+    to: MirrorId,
     mirror: Option<&'a mut Mirror>,
     counts: &'a mut Mirrored,
     clock: Option<ClockOffset>,
@@ -154,6 +168,7 @@ impl Rx {
                 mirrors: HashMap::new(),
                 streams: HashMap::new(),
                 clocks: HashMap::new(),
+                copying: Vec::new(),
                 traffic,
             },
             notices,
@@ -203,6 +218,7 @@ impl State {
             let now = ddx_store::now();
             self.receiver.handle_timeout(now);
             self.inbound.take(&mut self.receiver, now);
+            self.inbound.copy();
             self.report(now);
             if !self.spin {
                 ready = self.sleep([sockets[0].as_fd(), sockets[1].as_fd(), inbox.as_fd()], now);
@@ -215,10 +231,11 @@ impl State {
 
     /// Sleeps until something is there, and says which of the sockets has something.
     fn sleep(&self, fds: [BorrowedFd<'_>; 3], now: Time) -> [bool; 2] {
-        let span = self
-            .receiver
-            .poll_timeout()
-            .map_or(SLEEP_MAX, |(at, _why)| at.since(now).min(SLEEP_MAX));
+        let due = self.receiver.poll_timeout().map(|(at, _why)| at.since(now));
+        let span = match self.inbound.copying.is_empty() {
+            true => due.map_or(SLEEP_MAX, |span| span.min(SLEEP_MAX)),
+            false => Duration::ZERO,
+        };
         let span = Timespec {
             tv_sec: i64::try_from(span.as_secs()).unwrap_or(1),
             tv_nsec: span.subsec_nanos().into(),
@@ -282,6 +299,7 @@ impl State {
                         newest: Default::default(),
                         from: None,
                         passed: Passed::default(),
+                        copying: None,
                     },
                 );
             }
@@ -391,6 +409,7 @@ impl Inbound {
             mirrors,
             streams,
             clocks,
+            copying,
             traffic,
         } = self;
         let mut run: Option<Run<'_>> = None;
@@ -399,6 +418,7 @@ impl Inbound {
             if run.as_ref().is_none_or(|run| run.of != at) {
                 run = streams.get_mut(&at).map(|stream| Run {
                     of: at,
+                    to: stream.mirror,
                     mirror: mirrors.get_mut(&stream.mirror),
                     counts: &mut stream.counts,
                     // Nothing may have renewed it since the last stream ended.
@@ -414,10 +434,15 @@ impl Inbound {
                 run.counts.refused += 1;
                 continue;
             };
-            match mirror.take(&sample, run.clock.as_ref(), now) {
+            let len = sample.payload.len();
+            let fate = mirror.take(sample, run.clock.as_ref(), now);
+            if mirror.copying.is_some() && !copying.contains(&run.to) {
+                copying.push(run.to);
+            }
+            match fate {
                 Fate::Written => {
                     run.counts.written += 1;
-                    run.counts.bytes += sample.payload.len() as u64;
+                    run.counts.bytes += len as u64;
                 }
                 Fate::Stale => {
                     run.counts.stale += 1;
@@ -432,19 +457,49 @@ impl Inbound {
     }
 }
 
+impl Inbound {
+    /// Copies a piece of each large sample that is on its way into the store.
+    fn copy(&mut self) {
+        let mirrors = &mut self.mirrors;
+        self.copying.retain(|id| {
+            let mirror = mirrors.get_mut(id);
+            mirror.is_some_and(|mirror| mirror.copy(PIECE_BYTES))
+        });
+    }
+}
+
 impl Mirror {
+    /// Copies up to so many bytes of the large sample on its way. Whether more is left.
+    fn copy(&mut self, most: usize) -> bool {
+        let Some(copying) = &mut self.copying else {
+            return false;
+        };
+        let rest = &copying.payload[copying.copied..];
+        let piece = &rest[..rest.len().min(most)];
+        self.writer.fill(copying.copied, piece);
+        copying.copied += piece.len();
+        if copying.copied < copying.payload.len() {
+            return true;
+        }
+        self.writer.finish(&copying.origin);
+        self.copying = None;
+        false
+    }
+
     /// What another stream of the item goes on from.
     fn held(&self) -> Option<Held> {
         let newest = self.newest;
         self.from.map(|from| Held { from, newest })
     }
 
-    fn take(&mut self, sample: &Received<'_>, clock: Option<&ClockOffset>, now: Time) -> Fate {
+    fn take(&mut self, sample: Received<'_>, clock: Option<&ClockOffset>, now: Time) -> Fate {
         let meta = &sample.meta;
         if (meta.epoch, meta.seq) <= self.newest {
             return Fate::Stale;
         }
-        let passed = self.passed_until(sample);
+        // Those before come first.
+        self.copy(usize::MAX);
+        let passed = self.passed_until(&sample);
         // Without a measured clock the owner's instants say nothing here: the age is unknown, and says so.
         let local = |at: Time| clock.map_or(now, |clock| clock.to_local(at).min(now));
         let origin = Origin {
@@ -457,9 +512,25 @@ impl Mirror {
             receive: Some(now),
             bound_ns: Some(clock.map_or(u64::MAX, |clock| clock.bound_ns)),
         };
-        match self.writer.write_with(sample.payload, &origin) {
-            Ok(_position) => {
-                self.newest = (meta.epoch, meta.seq);
+        let newest = (meta.epoch, meta.seq);
+        let taken = match sample.payload {
+            Cow::Owned(payload) if payload.len() > PIECE_BYTES => {
+                let copied = 0;
+                self.writer.begin(payload.len()).map(|()| {
+                    self.copying = Some(Copying {
+                        payload,
+                        copied,
+                        origin,
+                    });
+                })
+            }
+            payload @ (Cow::Borrowed(_) | Cow::Owned(_)) => {
+                self.writer.write_with(&payload, &origin).map(|_seq| ())
+            }
+        };
+        match taken {
+            Ok(()) => {
+                self.newest = newest;
                 (self.from, self.passed) = (Some(sample.tag), passed);
                 Fate::Written
             }

@@ -48,6 +48,7 @@ pub struct RawWriter {
     seq: Seq,
     life: u64,
     mailbox: Arc<Mailbox>,
+    begun: Option<Slot>,
     // Dropped last: the daemon hears of the end when nothing is written any more.
     lease: Lease,
 }
@@ -215,6 +216,7 @@ impl RawWriter {
             seq: Seq(0),
             life,
             mailbox: Arc::default(),
+            begun: None,
             lease,
         };
         Ok((writer, fds))
@@ -262,6 +264,34 @@ impl RawWriter {
         let mut loan = self.loan(payload.len())?;
         loan.as_mut_slice().copy_from_slice(payload);
         Ok(loan.publish_with(origin))
+    }
+
+    /// Begins a sample of `len` bytes that is filled piece by piece, with [`RawWriter::fill`]; it shows when it is published by
+    /// [`RawWriter::finish`]. One that was begun before is given up. Fails as [`RawWriter::loan`] does.
+    pub fn begin(&mut self, len: usize) -> Result<(), Error> {
+        if let Some(given_up) = self.begun.take() {
+            self.segment.discard(given_up);
+        }
+        self.take_news()?;
+        self.begun = Some(self.segment.loan(len).map_err(loan_error)?);
+        Ok(())
+    }
+
+    /// Fills a piece of the sample that was begun, from byte `at` on. What lies beyond its end is left out.
+    pub fn fill(&mut self, at: usize, piece: &[u8]) {
+        if let Some(slot) = &mut self.begun
+            && let Some(room) = self.segment.slot_bytes_mut(slot).get_mut(at..)
+        {
+            let len = piece.len().min(room.len());
+            room[..len].copy_from_slice(&piece[..len]);
+        }
+    }
+
+    /// Publishes the sample that was begun, if one was.
+    pub fn finish(&mut self, origin: &Origin) {
+        if let Some(slot) = self.begun.take() {
+            self.segment.publish(slot, origin);
+        }
     }
 
     /// Memory for a payload of `len` bytes, with unspecified content. Never blocks. Fails when `len` is more than the

@@ -670,6 +670,55 @@ fn who_takes_samples_gets_small_ones_as_copies_and_large_ones_in_place() {
 }
 
 #[test]
+fn a_sample_that_is_filled_piece_by_piece_shows_when_it_is_whole() {
+    let daemon = Daemon::start(Quotas::default());
+    let store = daemon.store();
+    let options = WriterOptions {
+        depth: 2,
+        capacity_bytes: Some(8),
+        ..WriterOptions::default()
+    };
+    let schema = Schema::bytes();
+    let mut writer = store.raw_writer("n", &schema, options).unwrap();
+    let mut reader = store
+        .raw_reader("n", None, ReaderOptions::default())
+        .unwrap();
+    let origin = |seq| Origin {
+        epoch: Epoch(7),
+        seq: Seq(seq),
+        ..Origin::default()
+    };
+    let mut payload = Vec::new();
+    // More often than there are slots: none is lost with what is given up.
+    for round in 0..1_000 {
+        writer.begin(8).unwrap();
+        writer.fill(0, b"given up");
+        writer.begin(8).unwrap();
+        writer.fill(4, b"eful, and more");
+        // Another sample may be written meanwhile.
+        writer.write_with(b"early", &origin(2 * round + 1)).unwrap();
+        reader.next_into(&mut payload, LONG).unwrap().unwrap();
+        assert_eq!(payload, b"early");
+        writer.fill(0, b"care");
+        writer.fill(usize::MAX, b"nowhere");
+        writer.finish(&origin(2 * round + 2));
+        let meta = reader.next_into(&mut payload, LONG).unwrap().unwrap();
+        assert_eq!(payload, b"careeful");
+        assert_eq!((meta.epoch, meta.seq), (Epoch(7), Seq(2 * round + 2)));
+    }
+    writer.finish(&origin(9_999));
+    assert!(writer.begin(9).is_err());
+    writer.finish(&origin(9_999));
+    assert!(
+        reader
+            .next_into(&mut payload, Duration::ZERO)
+            .unwrap()
+            .is_none()
+    );
+    assert_eq!(writer.forced(), 0);
+}
+
+#[test]
 fn an_embedded_store_needs_no_socket() {
     let config = ddx_store::server::Config::new(HostName::parse("alone").unwrap());
     let (store, mut server) = Store::embedded(config).unwrap();

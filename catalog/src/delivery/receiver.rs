@@ -51,8 +51,6 @@ pub struct Receiver {
     nacks: VecDeque<(Tag, NackEntry)>,
     /// Payloads of the small samples in `ready`, back to back.
     inbox: Vec<u8>,
-    /// Payload of the large sample that the driver has in hand.
-    large: Vec<u8>,
     ready_bytes: usize,
     ordered_bytes: usize,
     ready: VecDeque<Ready>,
@@ -137,7 +135,6 @@ impl Receiver {
             reports: VecDeque::new(),
             nacks: VecDeque::new(),
             inbox: Vec::new(),
-            large: Vec::new(),
             ready_bytes: 0,
             ordered_bytes: 0,
             ready: VecDeque::new(),
@@ -281,12 +278,11 @@ impl Receiver {
         let payload = match ready.payload {
             Payload::Inbox(range) => {
                 self.ready_bytes -= range.len();
-                self.inbox.get(range)?
+                Cow::Borrowed(self.inbox.get(range)?)
             }
             Payload::Large(bytes) => {
                 self.ready_bytes -= bytes.len();
-                self.large = bytes;
-                self.large.as_slice()
+                Cow::Owned(bytes)
             }
         };
         Some(Received {

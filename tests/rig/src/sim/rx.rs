@@ -1,5 +1,6 @@
 //! The receiving half of a simulated host: drives a [`Receiver`] as the daemon's thread does, and judges each sample.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use ddx_catalog::delivery::{Books, Held, Passed, Received, Receiver, ReceiverConfig};
@@ -150,30 +151,14 @@ impl Rx {
     fn take_arrived(&mut self, now: Time) {
         let mut arrived = Vec::new();
         while let Some(sample) = self.receiver.poll_sample() {
-            let Received {
-                tag,
-                stream,
-                meta,
-                passed,
-                ..
-            } = sample;
-            arrived.push((tag, stream, meta, sample.payload.to_vec(), passed));
+            let payload = Cow::Owned(sample.payload.into_owned());
+            arrived.push(Received { payload, ..sample });
         }
-        for (tag, stream, meta, payload, passed) in &arrived {
-            let (tag, stream) = (*tag, *stream);
-            self.take(
-                &Received {
-                    tag,
-                    stream,
-                    meta: *meta,
-                    payload,
-                    passed: *passed,
-                },
-                now,
-            );
+        for sample in &arrived {
+            self.take(sample, now);
         }
-        for (tag, stream, ..) in &arrived {
-            self.check_books(*tag, *stream);
+        for sample in &arrived {
+            self.check_books(sample.tag, sample.stream);
         }
     }
 
@@ -206,7 +191,7 @@ impl Rx {
             return;
         };
         let newest = (sample.meta.epoch, sample.meta.seq);
-        let Some(told) = Payload::read(&mirror.name, sample.payload) else {
+        let Some(told) = Payload::read(&mirror.name, &sample.payload) else {
             self.broken.push(format!("`{}` is torn", mirror.name));
             return;
         };
