@@ -20,6 +20,7 @@ mod state;
 mod subscription;
 mod topic;
 mod up;
+mod video;
 mod watch;
 mod why;
 
@@ -43,7 +44,7 @@ use crate::error::{Exit, Failure, Hint as _, Outcome};
     disable_help_flag = true,
     disable_version_flag = true,
     max_term_width = 80,
-    help_template = "{about}\n{usage-heading} {usage}\n{subcommands}\n\n{options}{after-help}",
+    help_template = "{about}\n{usage-heading} {usage}\n{subcommands}\n{options}{after-help}",
     after_help = "\
 Examples: ddx up                          serve this host
           ddx put speed 1.5 --type f64    write an item
@@ -102,6 +103,9 @@ enum Verb {
     /// Publish real data (nmea, system)
     #[command(subcommand)]
     Source(source::Verb),
+    /// Streams of video (load, pattern, save)
+    #[command(subcommand)]
+    Video(video::Verb),
     /// Show two hosts, a link and its failures
     Demo(demo::Args),
     /// Names that those who come from ROS 2 know.
@@ -177,6 +181,7 @@ fn run(cli: Cli) -> Outcome {
         Verb::Host(verb) => host::run(context, &verb),
         Verb::Key(verb) => key::run(context, &verb),
         Verb::Source(verb) => source::run(context, &verb),
+        Verb::Video(verb) => video::run(context, &verb),
         Verb::Demo(args) => demo::run(context, &args),
         Verb::Topic(verb) => topic::run(context, &verb),
     }

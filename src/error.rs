@@ -60,6 +60,15 @@ impl Failure {
         self
     }
 
+    /// Says what was being done.
+    #[must_use]
+    pub fn context(self, what: impl fmt::Display + Send + Sync + 'static) -> Self {
+        Self {
+            error: self.error.context(what),
+            ..self
+        }
+    }
+
     /// The exit that the failure asks for.
     pub fn exit(&self) -> Exit {
         self.exit

@@ -10,3 +10,4 @@ mod manager;
 mod net;
 mod source;
 pub mod units;
+mod video;

@@ -6,7 +6,7 @@
 )]
 
 use std::fs;
-use std::io::{BufRead as _, BufReader};
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -406,6 +406,110 @@ fn no_daemon_is_an_error_with_a_hint() {
     let said = text(&refused.stderr);
     assert!(said.contains(socket.to_str().unwrap()), "{said}");
     assert!(said.contains("hint: start one with `ddx up`"), "{said}");
+}
+
+#[test]
+fn a_video_that_is_played_is_recorded_bit_for_bit() {
+    let daemon = Daemon::start(&[]);
+    let (played, recorded) = (daemon.dir.0.join("a.y4m"), daemon.dir.0.join("b.y4m"));
+    fs::write(&played, video(10)).unwrap();
+    let (played, recorded) = (played.to_str().unwrap(), recorded.to_str().unwrap());
+
+    let save = &[
+        "video", "save", "cam", "--output", recorded, "--frames", "10",
+    ];
+    let mut saving = daemon.background(save);
+    let loaded = daemon.json(&["video", "load", played, "--name", "cam", "--lockstep"]);
+    let saved = saving.0.wait().unwrap();
+
+    assert_eq!(loaded["frames"], 10);
+    assert_eq!(saved.code(), Some(0));
+    assert_eq!(fs::read(recorded).unwrap(), fs::read(played).unwrap());
+    let counter = daemon.json(&["get", "robot1/cam/counter"]);
+    assert_eq!(counter["value"]["sequence"], 10, "{counter}");
+    let info = daemon.json(&["get", "robot1/cam/info"]);
+    assert_eq!(info["value"]["fields"][0]["format"], "I420", "{info}");
+}
+
+#[test]
+fn a_video_is_played_as_recorded_at_a_rate_and_step_by_step() {
+    let daemon = Daemon::start(&[]);
+    let path = daemon.dir.0.join("a.y4m");
+    fs::write(&path, video(5)).unwrap();
+    let path = path.to_str().unwrap();
+
+    let load = &["video", "load", path, "--name", "cam"];
+    let interval = daemon.json(&[&load[..], &["--from", "2", "--to", "4"]].concat());
+    assert_eq!(interval["frames"], 3);
+    let fast = daemon.json(&[&load[..], &["--rate", "1 kHz"]].concat());
+    assert_eq!(fast["frames"], 5);
+
+    let mut stepping = command(&[&load[..], &["--step", "--from", "2"]].concat())
+        .env("DDX_SOCKET", daemon.socket())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut commands = stepping.stdin.take().unwrap();
+    commands.write_all(b"\n\np\n5\n\n1\nwhat\nq\n").unwrap();
+    let stepped = stepping.wait_with_output().unwrap();
+    let said = text(&stepped.stderr);
+    let said: Vec<&str> = said.lines().collect();
+    assert_eq!(
+        said,
+        [
+            "frame 2",
+            "frame 3",
+            "frame 4",
+            "frame 3",
+            "frame 5",
+            "there is no frame 6",
+            "frame 1 is not among those that are played",
+            "`what` is no command: an empty line, p, q or a number",
+        ]
+    );
+    assert_eq!(code(&stepped), 0);
+}
+
+#[test]
+fn each_kind_of_bad_video_file_is_named() {
+    let daemon = Daemon::start(&[]);
+    let file = |name: &str, content: &[u8]| {
+        let path = daemon.dir.0.join(name);
+        fs::write(&path, content).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let good = video(3);
+    let truncated = file("truncated.y4m", &good[..good.len() - 1]);
+    for (path, expected) in [
+        ("/nonexistent.y4m", "No such file"),
+        ("/", "is a directory"),
+        (&file("empty.y4m", b""), "it is empty"),
+        (&file("film.mp4", b"\0\0\0\x20ftypisom"), "an MP4 file"),
+        (
+            &file("short.y4m", b"YUV4MPEG2 W1"),
+            "first line does not end",
+        ),
+        (&file("wide.y4m", b"YUV4MPEG2 W0 H1\n"), "0x1 pixels"),
+        (&truncated, "in the middle of frame 3"),
+    ] {
+        let refused = daemon.ddx(&["video", "load", path, "--rate", "1 kHz"]);
+        let said = text(&refused.stderr);
+        assert_eq!(code(&refused), 1, "{path}: {said}");
+        assert!(said.contains(expected) && said.contains(path), "{said}");
+    }
+}
+
+/// A file of pictures of 16x8, of which each byte differs from the one before, and each frame from the last.
+fn video(frames: u8) -> Vec<u8> {
+    let mut file = b"YUV4MPEG2 W16 H8 F30:1 Ip A0:0 C420mpeg2 XCOLORRANGE=LIMITED\n".to_vec();
+    for frame in 1..=frames {
+        let ns = u64::from(frame - 1) * 10_000_000;
+        file.extend(format!("FRAME XDDX_NS={ns} XDDX_SEQ={frame}\n").bytes());
+        file.extend((0..192).map(|at: u8| at.wrapping_mul(3).wrapping_add(frame)));
+    }
+    file
 }
 
 impl Dir {

@@ -327,6 +327,16 @@ impl RawWriter {
         self.segment.forced()
     }
 
+    /// Readers on this host; one of them may stand for all of other hosts.
+    pub fn readers(&self) -> u32 {
+        self.segment.readers()
+    }
+
+    /// Whether each reader has taken the newest sample, by its own word.
+    pub fn is_consumed(&self) -> bool {
+        self.segment.is_consumed()
+    }
+
     #[inline]
     fn take_news(&mut self) -> Result<(), Error> {
         self.lease.connection.follow()?;

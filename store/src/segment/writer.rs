@@ -5,10 +5,10 @@ use std::sync::Arc;
 use ddx_wire::Epoch;
 use thiserror::Error;
 
-use super::{HeapSegment, Origin, SegmentError, SegmentFds, State};
+use super::{HeapSegment, Origin, ReaderBooks, SegmentError, SegmentFds, State};
 use crate::layout::{self, Header, Shape, Spec};
 use crate::notify::Bells;
-use crate::ring::{RingWriter, Words};
+use crate::ring::{RingWriter, Words, cell_books};
 use crate::shm::{Map, fork, heap, memfd};
 use crate::sync::Ordering;
 
@@ -168,6 +168,26 @@ impl SegmentWriter {
     /// Samples overwritten while a reader held them beyond its quota. Growth means that a reader lies or died unseen.
     pub fn forced(&self) -> u64 {
         self.ring.forced()
+    }
+
+    /// Readers that have taken their seats, by their own word.
+    pub fn readers(&self) -> u32 {
+        self.open_cells().count_ones()
+    }
+
+    /// Whether each of them says that it has read the newest sample.
+    pub fn is_consumed(&self) -> bool {
+        let (open, newest) = (self.open_cells(), self.ring.published());
+        let cells = (0..self.spec().cells).filter(|cell| open >> cell & 1 == 1);
+        let mut books = cells.map(|cell| cell_books(self.ring.ctl(), self.ring.shape(), cell));
+        books.all(|words| ReaderBooks::from_words(&words).is_some_and(|books| books.pos >= newest))
+    }
+
+    fn open_cells(&self) -> u64 {
+        if fork::is_past(self.generation) {
+            return 0;
+        }
+        self.ring.ctl().load(layout::OPEN, Ordering::Relaxed)
     }
 
     /// What became of the segment; a superseded writer has lost its lease.

@@ -1,0 +1,104 @@
+//! `ddx video`: puts streams of video into the store and takes them out.
+
+mod load;
+mod pattern;
+mod save;
+
+use std::thread;
+use std::time::Duration;
+
+use ddx_wire::Time;
+
+use super::Context;
+use super::interrupt::Interrupt;
+use crate::error::Outcome;
+use crate::video::play::Lateness;
+
+/// What to do.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Verb {
+    /// Play a Y4M file, or a pipe of ffmpeg, into an item
+    Load(load::Args),
+    /// Publish a moving picture that carries its number and time
+    Pattern(pattern::Args),
+    /// Record a stream to a Y4M file, bit for bit
+    Save(save::Args),
+}
+
+/// Runs the verb.
+pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
+    match verb {
+        Verb::Load(args) => load::run(context, args),
+        Verb::Pattern(args) => pattern::run(context, args),
+        Verb::Save(args) => save::run(context, args),
+    }
+}
+
+/// Sleeps until `due`; false when the program should end first.
+fn sleep_until(due: Time, interrupt: &Interrupt) -> bool {
+    loop {
+        if interrupt.is_raised() {
+            return false;
+        }
+        let left = due.since(ddx_store::now());
+        if left.is_zero() {
+            return true;
+        }
+        thread::sleep(left.min(SLICE));
+    }
+}
+
+fn late(lateness: &Lateness) -> String {
+    let us = |span: Duration| span.as_micros();
+    format!(
+        "late by {} us in the median, 99 % within {} us, at most {} us",
+        us(lateness.p50),
+        us(lateness.p99),
+        us(lateness.max)
+    )
+}
+
+/// `640x480`, or the name of a usual size.
+fn size(text: &str) -> Result<(u32, u32), String> {
+    let named = SIZES
+        .iter()
+        .find(|(name, ..)| name.eq_ignore_ascii_case(text));
+    if let Some((_, width, height)) = named {
+        return Ok((*width, *height));
+    }
+    let sides = text.split_once('x');
+    let sides = sides.and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    sides.ok_or_else(|| {
+        let names: Vec<&str> = SIZES.iter().map(|(name, ..)| *name).collect();
+        format!(
+            "`{text}` is not a size: write one as `640x480`, or {}",
+            names.join(", ")
+        )
+    })
+}
+
+/// Longest sleep: how late an interrupt may be heard.
+const SLICE: Duration = Duration::from_millis(50);
+const SIZES: [(&str, u32, u32); 9] = [
+    ("sqcif", 128, 96),
+    ("qcif", 176, 144),
+    ("qvga", 320, 240),
+    ("cif", 352, 288),
+    ("vga", 640, 480),
+    ("pal", 768, 576),
+    ("svga", 800, 600),
+    ("720p", 1280, 720),
+    ("1080p", 1920, 1080),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_names_or_numbers() {
+        assert_eq!(size("CIF"), Ok((352, 288)));
+        assert_eq!(size("12x34"), Ok((12, 34)));
+        assert!(size("12").unwrap_err().contains("640x480"));
+    }
+}
