@@ -4,8 +4,10 @@ use std::io::Read as _;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
+use std::time::Duration;
 
 use anyhow::Context as _;
+use ddx_wire::Time;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::Notify;
 
@@ -67,6 +69,20 @@ impl Interrupt {
         self.shared.raised.load(Ordering::Relaxed)
     }
 
+    /// Sleeps until `due`; false when the program should end first.
+    pub(crate) fn sleep_until(&self, due: Time) -> bool {
+        loop {
+            if self.is_raised() {
+                return false;
+            }
+            let left = due.since(ddx_store::now());
+            if left.is_zero() {
+                return true;
+            }
+            thread::sleep(left.min(SLICE));
+        }
+    }
+
     /// Completes when the program should end.
     pub(crate) async fn raised(self) {
         while !self.is_raised() {
@@ -80,3 +96,6 @@ impl Interrupt {
         self.shared.wake.notify_one();
     }
 }
+
+/// Longest sleep: how late an interrupt may be heard.
+pub(super) const SLICE: Duration = Duration::from_millis(50);

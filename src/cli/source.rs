@@ -1,10 +1,8 @@
 //! `ddx source`: publishes real data until it ends or is interrupted.
 
 use std::path::PathBuf;
-use std::thread;
 use std::time::Duration;
 
-use ddx_wire::Time;
 use serde_json::json;
 
 use super::Context;
@@ -64,7 +62,7 @@ fn play(context: &mut Context, args: &Nmea) -> Outcome {
     let mut passes = 0_u64;
     let mut next = Some(ddx_store::now());
     while let Some(start) = next {
-        next = player.play(&log, start, args.rate, |due| sleep_until(due, &interrupt))?;
+        next = player.play(&log, start, args.rate, |due| interrupt.sleep_until(due))?;
         passes += u64::from(next.is_some());
         next = next.filter(|_| args.looped);
     }
@@ -88,26 +86,12 @@ fn measure(context: &Context, args: &System) -> Outcome {
     let mut gauge = system::Gauge::open(&context.store("source system")?, &args.name)?;
     let interval = Duration::from_secs_f64(args.rate.recip());
     let mut due = ddx_store::now();
-    while sleep_until(due, &interrupt) {
+    while interrupt.sleep_until(due) {
         gauge.publish()?;
         // A machine that was asleep does not catch up.
         due = (due + interval).max(ddx_store::now());
     }
     Ok(Exit::Done)
-}
-
-/// Sleeps until `due`; false when the program should end first.
-fn sleep_until(due: Time, interrupt: &Interrupt) -> bool {
-    loop {
-        if interrupt.is_raised() {
-            return false;
-        }
-        let left = due.since(ddx_store::now());
-        if left.is_zero() {
-            return true;
-        }
-        thread::sleep(left.min(SLICE));
-    }
 }
 
 fn factor(text: &str) -> Result<f64, String> {
@@ -116,6 +100,3 @@ fn factor(text: &str) -> Result<f64, String> {
         Ok(_) | Err(_) => Err(format!("`{text}` is not a factor between 0.001 and 10000")),
     }
 }
-
-/// Longest sleep: how late an interrupt may be heard.
-const SLICE: Duration = Duration::from_millis(50);

@@ -4,13 +4,10 @@ mod load;
 mod pattern;
 mod save;
 
-use std::thread;
 use std::time::Duration;
 
-use ddx_wire::Time;
-
 use super::Context;
-use super::interrupt::Interrupt;
+use super::interrupt::SLICE;
 use crate::error::Outcome;
 use crate::video::play::Lateness;
 
@@ -31,20 +28,6 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         Verb::Load(args) => load::run(context, args),
         Verb::Pattern(args) => pattern::run(context, args),
         Verb::Save(args) => save::run(context, args),
-    }
-}
-
-/// Sleeps until `due`; false when the program should end first.
-fn sleep_until(due: Time, interrupt: &Interrupt) -> bool {
-    loop {
-        if interrupt.is_raised() {
-            return false;
-        }
-        let left = due.since(ddx_store::now());
-        if left.is_zero() {
-            return true;
-        }
-        thread::sleep(left.min(SLICE));
     }
 }
 
@@ -77,8 +60,6 @@ fn size(text: &str) -> Result<(u32, u32), String> {
     })
 }
 
-/// Longest sleep: how late an interrupt may be heard.
-const SLICE: Duration = Duration::from_millis(50);
 const SIZES: [(&str, u32, u32); 9] = [
     ("sqcif", 128, 96),
     ("qcif", 176, 144),

@@ -15,7 +15,7 @@ use serde_json::json;
 use super::super::Context;
 use super::super::interrupt::Interrupt;
 use super::super::output::note;
-use super::{SLICE, late, sleep_until};
+use super::{SLICE, late};
 use crate::error::{Exit, Failure, Outcome};
 use crate::units;
 use crate::video::StreamWriter;
@@ -156,7 +156,7 @@ impl Player {
                     let now = ddx_store::now();
                     let schedule = schedule.get_or_insert_with(|| Schedule::new(now, at));
                     let due = schedule.due(at);
-                    let goes_on = sleep_until(due, interrupt);
+                    let goes_on = interrupt.sleep_until(due);
                     let now = ddx_store::now();
                     schedule.note(due, now);
                     goes_on.then_some(now)

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::super::Context;
 use super::super::interrupt::Interrupt;
-use super::{late, size, sleep_until};
+use super::{late, size};
 use crate::error::{Exit, Hint as _, Outcome};
 use crate::units;
 use crate::video::StreamWriter;
@@ -48,7 +48,7 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
             Duration::from_secs_f64(f64::from(n) / args.rate)
         });
         let due = schedule.due(at);
-        if !sleep_until(due, &interrupt) {
+        if !interrupt.sleep_until(due) {
             break;
         }
         frames += 1;

@@ -13,6 +13,7 @@ use super::super::Context;
 use super::super::interrupt::Interrupt;
 use super::super::output::note;
 use super::super::render::bytes;
+use super::SLICE;
 use crate::error::{Exit, Failure, Hint as _, Outcome};
 use crate::units;
 use crate::video::recorder::{Recorder, Refused, Sink};
@@ -183,8 +184,6 @@ fn whole(number: f64) -> usize {
     number as usize
 }
 
-/// How late an interrupt may be heard.
-const SLICE: Duration = Duration::from_millis(50);
 /// After so long without a first frame the user is told.
 const QUIET: Duration = Duration::from_secs(2);
 /// Frames that wait at most.
