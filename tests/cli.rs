@@ -432,6 +432,18 @@ fn a_video_that_is_played_is_recorded_bit_for_bit() {
 }
 
 #[test]
+fn at_the_end_of_a_video_nobody_is_waited_for() {
+    let daemon = Daemon::start(&[]);
+    let path = daemon.dir.0.join("a.y4m");
+    fs::write(&path, video(0)).unwrap();
+    let path = path.to_str().unwrap();
+
+    let loaded = daemon.json(&["video", "load", path, "--lockstep"]);
+
+    assert_eq!(loaded["frames"], 0);
+}
+
+#[test]
 fn a_video_is_played_as_recorded_at_a_rate_and_step_by_step() {
     let daemon = Daemon::start(&[]);
     let path = daemon.dir.0.join("a.y4m");

@@ -313,6 +313,18 @@ impl<R: BufRead> Reader<R> {
         &self.layout
     }
 
+    /// Whether no frame follows.
+    ///
+    /// # Errors
+    /// [`Error::Read`].
+    pub fn is_at_end(&mut self) -> Result<bool, Error> {
+        match self.input.fill_buf() {
+            Ok(bytes) => Ok(bytes.is_empty()),
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => Ok(false),
+            Err(error) => Err(Error::Read(error)),
+        }
+    }
+
     /// Reads the line before the next frame; `None` at the end of the file. The frame's planes follow, by
     /// [`Reader::read_planes`].
     ///

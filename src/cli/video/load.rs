@@ -146,7 +146,8 @@ impl Player {
             self.schedule = None;
             self.skip_to(args.from)?;
             while args.to.is_none_or(|to| self.next <= to) {
-                if args.lockstep && !self.is_awaited(interrupt) {
+                // Nobody reads any more who has what they wanted: at the end there is nothing to wait for.
+                if args.lockstep && !self.reader.is_at_end()? && !self.is_awaited(interrupt) {
                     return Ok(());
                 }
                 let pace = |at: Duration, schedule: &mut Option<Schedule>| {
