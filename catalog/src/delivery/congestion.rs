@@ -27,8 +27,10 @@ pub(super) struct Congestion {
     loss_mean: f64,
     /// Newest growth of the time on the way.
     queue: Duration,
-    /// How much that differs from report to report.
-    jitter: Duration,
+    /// How much that differs from report to report, of few datagrams and of many, whose fastest is rarely held up.
+    jitter: [Duration; 2],
+    /// Whether the newest report is one of many.
+    dense: bool,
     /// The newest reports, enough to tell a rate, and whether what they say is lost was lost on a path that was not full.
     arrived: VecDeque<(Progress, bool)>,
     /// What the path carried when it was last full; none before, when the rate is a guess.
@@ -74,7 +76,8 @@ impl Congestion {
             loss_now: 0.0,
             loss_mean: 0.0,
             queue: Duration::ZERO,
-            jitter: JITTER_FIRST,
+            jitter: [JITTER_FIRST; 2],
+            dense: false,
             arrived: VecDeque::new(),
             ceiling: None,
             ceiling_share: 1.0,
@@ -168,6 +171,10 @@ impl Congestion {
             share,
         } = way;
         self.share = share.clamp(SHARE_MIN, SHARE_MAX);
+        // On a link with much jitter the fastest of many differs slowly, and by more than it seems.
+        self.dense = progress.received >= DENSE_DATAGRAMS
+            && progress.span < DENSE_SPAN
+            && self.jitter[0] < DENSE_JITTER;
         let queue_before = std::mem::replace(&mut self.queue, queue);
         if queue_before <= self.queue_low() && !self.is_trying(used) {
             self.note_jitter(queue.saturating_sub(queue_before));
@@ -186,6 +193,14 @@ impl Congestion {
         let (arrived, lost, datagrams) = self.of_late(progress, busy);
         let capacity = arrived / (1.0 - self.loss.min(0.7));
         self.limited |= used.limited;
+        if let Some(ceiling) = self.ceiling
+            && !used.limited
+            && self.bytes_per_second < BEYOND * ceiling
+        {
+            // What was tried as there was nothing more to send was not tried.
+            self.bytes_per_second = self.bytes_per_second.min(STAY * ceiling);
+            self.beyond = 0;
+        }
         if shorter >= SHORTER_MIN.max(self.datagram_time() / 2) {
             // No link got faster by waiting: this is another one.
             (self.ceiling, self.beyond) = (None, 0);
@@ -206,7 +221,7 @@ impl Congestion {
             None => low,
             // One report may be late for reasons of its own.
             Some(_) if queue_before <= low => 2 * QUEUE_LOW_MAX,
-            Some(_) => 2 * low,
+            Some(_) => (2 * low).max(FULL_MIN),
         };
         if self.queue >= full {
             if now >= self.slowed_until && self.was_sent_since(progress) {
@@ -231,6 +246,8 @@ impl Congestion {
             }
             if self.queue > low && now >= self.slowed_until {
                 self.draw_back(capacity, seen_after, now);
+            } else if self.dense && self.queue > self.datagram_time().max(QUEUE_LOW_MIN) + low / 4 {
+                self.drain(seen_after, now);
             } else if self.limited && now >= self.grown_at.max(self.slowed_at) + seen_after {
                 self.grow(capacity, seen_after, now);
             }
@@ -247,11 +264,13 @@ impl Congestion {
 
     fn note_jitter(&mut self, differs: Duration) {
         let differs = differs.min(QUEUE_LOW_MAX);
+        let jitter = &mut self.jitter[usize::from(self.dense)];
+        let lasts = if self.dense { 16 } else { 64 };
         // What is seldom counts for long.
-        self.jitter = if differs > self.jitter {
-            (3 * self.jitter + differs) / 4
+        *jitter = if differs > *jitter {
+            (3 * *jitter + differs) / 4
         } else {
-            (63 * self.jitter + differs) / 64
+            ((lasts - 1) * *jitter + differs) / lasts
         };
     }
 
@@ -262,7 +281,8 @@ impl Congestion {
     /// Growth of the time on the way up to which nothing piles up, as far as one can tell.
     fn queue_low(&self) -> Duration {
         // What else passes in between takes its time.
-        (4 * self.jitter + self.datagram_time().max(QUEUE_LOW_MIN)).min(QUEUE_LOW_MAX)
+        let jitter = self.jitter[usize::from(self.dense)];
+        (4 * jitter + self.datagram_time().max(QUEUE_LOW_MIN)).min(QUEUE_LOW_MAX)
     }
 
     fn slowed(&mut self, sent: u32, seen_after: Duration, now: Time) {
@@ -319,7 +339,10 @@ impl Congestion {
 
     /// Share of what the path carries at which what has piled up is gone soon.
     fn share_to_drain(&self, seen_after: Duration) -> f64 {
-        let drain = (4 * seen_after).clamp(DRAIN_MIN, DRAIN_MAX);
+        let drain = match self.dense {
+            true => 2 * seen_after,
+            false => (4 * seen_after).clamp(DRAIN_MIN, DRAIN_MAX),
+        };
         let share = 1.0 - self.queue.as_secs_f64() / drain.as_secs_f64();
         share.clamp(0.6, STAY)
     }
@@ -348,6 +371,18 @@ impl Congestion {
         (self.beyond, self.try_at) = (0, now + self.try_pause);
     }
 
+    /// Something has piled up for a moment, for whatever reason: it is let go soon.
+    fn drain(&mut self, seen_after: Duration, now: Time) {
+        let Some(ceiling) = self.ceiling else {
+            return;
+        };
+        let lowered = self.share_to_drain(seen_after) * ceiling;
+        if lowered < self.bytes_per_second && self.bytes_per_second <= STAY * ceiling {
+            self.bytes_per_second = lowered;
+            self.grown_at = now;
+        }
+    }
+
     /// Nothing piles up, and more could be sent.
     fn grow(&mut self, capacity: f64, seen_after: Duration, now: Time) {
         let rate = self.bytes_per_second;
@@ -355,13 +390,13 @@ impl Congestion {
         let tried = rate.max(4.0 * capacity).max(RATE_FIRST / 8.0);
         let grown = match self.ceiling {
             None => rate * 1.5,
-            Some(ceiling) if rate < 0.9 * ceiling => (rate * 1.5).min(STAY * ceiling),
+            Some(ceiling) if rate < STAY * ceiling => (rate * 1.5).min(STAY * ceiling),
             Some(_) if now < self.try_at => return,
             Some(ceiling) => {
                 // What piles up before it is seen stays small.
                 let time = seen_after.as_secs_f64().max(0.001);
                 let low = self.queue_low().as_secs_f64() / time;
-                let mut share = (low / 3.0).clamp(0.0025, 0.05) / self.share;
+                let mut share = (low / 3.0).clamp(0.0025, 0.025) / self.share;
                 if rate > ceiling * (1.0 + low / 2.0).clamp(1.03, BEYOND) {
                     self.beyond += 1;
                     share = (share * f64::from(1_u32 << self.beyond.min(7))).min(0.5);
@@ -455,6 +490,8 @@ const DATAGRAM: f64 = 1_500.0;
 const QUEUE_LOW_MIN: Duration = Duration::from_micros(200);
 /// Growth that says something, whatever the jitter: twice as much is a third of what queues on the way should hold.
 pub(super) const QUEUE_LOW_MAX: Duration = Duration::from_millis(15);
+/// Growth that is no cause to think less of a path, whatever the jitter: what a thread that is kept waiting makes.
+const FULL_MIN: Duration = Duration::from_millis(1);
 /// A guess for a path that was never used.
 const JITTER_FIRST: Duration = Duration::from_millis(1);
 /// How long what has piled up may take to drain: some of the times that it takes to see that.
@@ -480,6 +517,10 @@ const SHARE_MUCH: f64 = 1.2;
 /// Bounds of the share that a sender believes.
 const SHARE_MIN: f64 = 0.25;
 const SHARE_MAX: f64 = 3.0;
+/// Datagrams in a report of many, its span, and the jitter up to which the fastest of them tells what has piled up.
+const DENSE_DATAGRAMS: u32 = 16;
+const DENSE_SPAN: Duration = Duration::from_millis(10);
+const DENSE_JITTER: Duration = Duration::from_millis(2);
 /// Datagrams that tell a rate, whatever the jitter of each.
 const ARRIVED_DATAGRAMS: u32 = 8;
 /// Least time that tells a rate.

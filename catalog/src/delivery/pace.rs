@@ -53,16 +53,21 @@ impl Pace {
     /// Notes that a batch goes now, at `rate` bytes per second.
     pub(super) fn spend(&mut self, bytes: usize, rate: u64, now: Time) {
         let span = span_of(bytes, rate);
-        self.used.idle += now.since(self.free_at.max(self.asked));
+        self.used.idle += self.idle(now);
         // A thread that woke late may catch up on one burst, not on its whole idle time.
         self.free_at = self.free_at.max(now - BURST) + span;
     }
 
     /// How it was used since this was last called.
     pub(super) fn take_used(&mut self, now: Time) -> Used {
-        self.used.idle += now.since(self.free_at.max(self.asked));
+        self.used.idle += self.idle(now);
         self.asked = now;
         std::mem::take(&mut self.used)
+    }
+
+    /// Time since it was last asked that was left unused, and that cannot be caught up on.
+    fn idle(&self, now: Time) -> Duration {
+        now.since((self.free_at + BURST).max(self.asked))
     }
 }
 
@@ -111,7 +116,7 @@ mod tests {
         let later = now + Duration::from_secs(1);
         let idle = Used {
             limited: false,
-            idle: later.since(pace.free_at),
+            idle: later.since(pace.free_at + BURST),
         };
         assert_eq!(pace.take_used(later), idle);
     }

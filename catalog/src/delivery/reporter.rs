@@ -56,11 +56,11 @@ pub(super) struct Strain {
     loss: f64,
 }
 
-/// Least value of the last ten to twenty seconds.
+/// Least value of the last ten to twenty seconds, which rises by what the two clocks may differ in rate.
 #[derive(Debug, Default)]
 struct Least {
-    present: Option<i64>,
-    former: Option<i64>,
+    present: Option<(i64, Time)>,
+    former: Option<(i64, Time)>,
     since: Time,
 }
 
@@ -125,7 +125,7 @@ impl Reporter {
         self.last = *report;
         self.round_trip = round_trip(report, now);
         let delay = i64::from(report.delay_us.wrapping_sub(self.zero).cast_signed());
-        let before = self.least.get();
+        let before = self.least.get(now);
         let least = self.least.update(delay, now);
         let micros = |span: i64| Duration::from_micros(u64::try_from(span).unwrap_or(0));
         let queue = micros(delay.saturating_sub(least));
@@ -171,8 +171,9 @@ fn round_trip(report: &ReportEntry, now: Time) -> Option<Duration> {
 }
 
 impl Least {
-    fn get(&self) -> Option<i64> {
-        self.present.into_iter().chain(self.former).min()
+    fn get(&self, now: Time) -> Option<i64> {
+        let both = self.present.into_iter().chain(self.former);
+        both.map(|least| risen(least, now)).min()
     }
 
     /// Takes in a value; the least one of late.
@@ -181,16 +182,24 @@ impl Least {
             self.former = self.present.take();
             self.since = now;
         }
-        let present = self.present.map_or(value, |least| least.min(value));
-        self.present = Some(present);
-        self.former.map_or(present, |former| former.min(present))
+        if self.present.is_none_or(|least| value <= risen(least, now)) {
+            self.present = Some((value, now));
+        }
+        self.get(now).unwrap_or(value)
     }
+}
+
+fn risen((value, at): (i64, Time), now: Time) -> i64 {
+    let drift = now.since(at).as_micros() * CLOCK_RATES_PPM / 1_000_000;
+    value.saturating_add(i64::try_from(drift).unwrap_or(i64::MAX))
 }
 
 /// What takes longer is an error of a peer.
 const ROUND_TRIP_MAX: Duration = Duration::from_secs(10);
 /// How long the least time on the way is remembered, once or twice: clocks drift, and routes change.
 const WINDOW: Duration = Duration::from_secs(10);
+/// What the rates of two clocks differ by, at most: each is specified within 100 parts of a million.
+const CLOCK_RATES_PPM: u128 = 200;
 /// Reports come every 50 ms while there is enough to report.
 const STRAIN_LASTS: Duration = Duration::from_millis(500);
 
@@ -246,12 +255,12 @@ mod tests {
             let way = heard.unwrap().1;
             (way.queue.as_micros(), way.shorter.as_micros())
         };
-        assert_eq!(queue(2, 1_400, 1), (400, 0));
-        assert_eq!(queue(3, 800, 2), (0, 200));
-        assert_eq!(queue(4, u32::MAX - 99, 3), (0, 900), "below zero");
-        assert_eq!(queue(5, 900, 4), (1_000, 0));
+        assert_eq!(queue(2, 1_400, 1), (200, 0), "0.2 ms may be the clocks'");
+        assert_eq!(queue(3, 800, 2), (0, 600), "below what it may be by now");
+        assert_eq!(queue(4, u32::MAX - 99, 3), (0, 1_100), "below zero");
+        assert_eq!(queue(5, 900, 4), (800, 0));
         // Forgotten after twenty seconds.
-        assert_eq!(queue(6, 900, 30), (1_000, 0));
-        assert_eq!(queue(7, 900, 60).0, 0);
+        assert_eq!(queue(6, 5_100, 15), (2_800, 0));
+        assert_eq!(queue(7, 9_300, 26).0, 4_200 - 2_200);
     }
 }
