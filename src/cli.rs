@@ -103,7 +103,7 @@ enum Verb {
     /// Publish real data (nmea, system)
     #[command(subcommand)]
     Source(source::Verb),
-    /// Streams of video (load, pattern, save)
+    /// Streams of video (load, save, view, serve, ...)
     #[command(subcommand)]
     Video(video::Verb),
     /// Show two hosts, a link and its failures

@@ -3,6 +3,7 @@
 
 pub(crate) mod play;
 pub(crate) mod recorder;
+pub(crate) mod terminal;
 
 use anyhow::Context as _;
 use ddx_store::{
@@ -159,10 +160,16 @@ impl StreamWriter {
 }
 
 impl StreamReader {
-    /// Opens a reader of the frames of `name`, of the newest or of each.
-    pub(crate) fn open(store: &Store, name: &str, delivery: Delivery) -> Result<Self, Failure> {
+    /// Opens a reader of the frames of `name`, of the newest or of each, and of at most so many a second of another host.
+    pub(crate) fn open(
+        store: &Store,
+        name: &str,
+        delivery: Delivery,
+        rate: Option<f64>,
+    ) -> Result<Self, Failure> {
         let options = ReaderOptions {
             delivery,
+            rate,
             pins: 2,
             ..ReaderOptions::default()
         };
@@ -180,6 +187,24 @@ impl StreamReader {
     /// The reader itself.
     pub(crate) fn frames(&mut self) -> &mut RawReader {
         &mut self.frames
+    }
+}
+
+/// Whether the samples of an item are frames.
+pub(crate) fn is_stream(other: &Schema) -> bool {
+    schema().is_ok_and(|schema| schema == *other)
+}
+
+/// What a frame says of itself, in place of its planes.
+pub(crate) fn summary(payload: &[u8]) -> Value {
+    match Frame::parse(payload) {
+        Ok(frame) => json!({
+            "frame": frame.info().sequence,
+            "capture_ns": frame.info().capture_ns,
+            "clock": format!("{:?}", frame.info().clock),
+            "fields": frame.fields().map(|field| field.info.to_string()).collect::<Vec<_>>(),
+        }),
+        Err(fault) => json!({ "undecodable": fault.to_string() }),
     }
 }
 

@@ -6,7 +6,8 @@
 )]
 
 use std::fs;
-use std::io::{BufRead as _, BufReader, Write as _};
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -485,6 +486,117 @@ fn a_video_is_played_as_recorded_at_a_rate_and_step_by_step() {
 }
 
 #[test]
+fn the_present_frame_is_a_picture_and_the_stream_is_known() {
+    let daemon = Daemon::start(&[]);
+    let pattern = ["video", "pattern", "--name", "cam", "--size", "64x64"];
+    let _camera = daemon.background(&pattern);
+    let path = |extension: &str| daemon.dir.0.join(format!("a.{extension}"));
+    for (extension, magic) in [
+        ("ppm", b"P6\n64 64\n255\n".as_slice()),
+        ("png", b"\x89PNG\r\n"),
+        ("jpg", &[0xff, 0xd8, 0xff]),
+        ("tiff", b"II*\0"),
+    ] {
+        let path = path(extension);
+        let snap = ["video", "snap", "cam", "--output", path.to_str().unwrap()];
+        let snapped = daemon.json(&snap);
+        assert_eq!(snapped["width"], 64, "{snapped}");
+        assert!(fs::read(path).unwrap().starts_with(magic), "{extension}");
+    }
+    for (arguments, expected) in [
+        (["--output", "a.gif"], "`gif` is no kind of picture"),
+        (["--output", "/nonexistent/a.png"], "/nonexistent/a.png"),
+    ] {
+        let refused = daemon.ddx(&[&["video", "snap", "cam"], &arguments[..]].concat());
+        let said = text(&refused.stderr);
+        assert_ne!(code(&refused), 0);
+        assert!(said.contains(expected), "{said}");
+    }
+
+    let measured = daemon.json(&["hz", "cam", "--count", "1"]);
+    assert_eq!(measured["fields"], "64x64 I420", "{measured}");
+    let info = daemon.json(&["info", "cam"]);
+    assert_eq!(info["stream"]["source"], "pattern", "{info}");
+    let view = ["video", "view", "cam", "--size", "20x12", "--frames", "2"];
+    let seen = daemon.ddx(&view);
+    assert_eq!(code(&seen), 0, "{}", text(&seen.stderr));
+    // Ten rows of twenty cells, twice.
+    assert_eq!(text(&seen.stdout).matches('▀').count(), 2 * 10 * 20);
+    let seen = daemon.ddx(&["video", "view", "cam"]);
+    assert_eq!(code(&seen), 2);
+    assert!(text(&seen.stderr).contains("is no terminal"));
+}
+
+#[test]
+fn a_browser_is_shown_streams_and_the_page_of_a_stranger_is_not() {
+    let daemon = Daemon::start(&[]);
+    let pattern = ["video", "pattern", "--name", "cam", "--size", "64x64"];
+    let _camera = daemon.background(&pattern);
+    let serve = ["--json", "video", "serve", "--listen", "127.0.0.1:0"];
+    let mut server = command(&serve)
+        .env("DDX_SOCKET", daemon.socket())
+        .stdout(Stdio::piped())
+        .spawn()
+        .map(Background)
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(server.0.stdout.take().unwrap())
+        .read_line(&mut line)
+        .unwrap();
+    let said: Value = serde_json::from_str(&line).unwrap();
+    let url = said["url"].as_str().unwrap();
+    let address = url.trim_start_matches("http://").trim_end_matches('/');
+    let ask = |path: &str, host: &str| {
+        let mut server = TcpStream::connect(address).unwrap();
+        write!(
+            server,
+            "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
+        )
+        .unwrap();
+        server
+    };
+    let whole = |path: &str, host: &str| {
+        let mut answer = Vec::new();
+        ask(path, host).read_to_end(&mut answer).unwrap();
+        answer
+    };
+    let has = |answer: &[u8], part: &[u8]| answer.windows(part.len()).any(|seen| seen == part);
+
+    assert!(has(&whole("/", address), b"<!doctype html>"));
+    let streams = whole("/streams", address);
+    assert!(has(&streams, b"robot1/cam"), "{}", lossy(&streams));
+    let png = whole("/snap.png?name=robot1/cam", address);
+    assert!(has(&png, b"image/png") && has(&png, b"\x89PNG"));
+    for (path, expected) in [
+        ("/snap.png", b"HTTP/1.1 400".as_slice()),
+        ("/movie?name=robot1/cam&rate=0", b"HTTP/1.1 400"),
+        ("/snap.png?name=robot1/cam&field=x", b"HTTP/1.1 404"),
+        ("/nothing", b"HTTP/1.1 404"),
+    ] {
+        let refused = whole(path, address);
+        assert!(refused.starts_with(expected), "{}", lossy(&refused));
+    }
+    let strange = whole("/streams", "evil.example");
+    assert!(strange.starts_with(b"HTTP/1.1 403"), "{}", lossy(&strange));
+
+    let mut movie = BufReader::new(ask("/movie?name=robot1/cam", address));
+    let mut frames = 0;
+    while frames < 3 {
+        let mut line = Vec::new();
+        assert_ne!(movie.read_until(b'\n', &mut line).unwrap(), 0);
+        frames += usize::from(line == b"--ddx-frame\r\n");
+    }
+    let readers = || {
+        let info = daemon.json(&["info", "cam"]);
+        info["reader_list"].as_array().unwrap().len()
+    };
+    assert_eq!(readers(), 1);
+    drop(movie);
+    // A movie that nobody looks at any more reads no more.
+    while readers() > 0 {}
+}
+
+#[test]
 fn each_kind_of_bad_video_file_is_named() {
     let daemon = Daemon::start(&[]);
     let file = |name: &str, content: &[u8]| {
@@ -635,6 +747,10 @@ fn ddx(arguments: &[&str]) -> Output {
 
 fn code(output: &Output) -> i32 {
     output.status.code().unwrap()
+}
+
+fn lossy(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
 }
 
 fn text(bytes: &[u8]) -> String {

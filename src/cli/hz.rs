@@ -25,6 +25,8 @@ pub(crate) struct Args {
 #[derive(Debug, Default)]
 struct Intervals {
     ns: Vec<u64>,
+    /// Of a stream of video: the numbers of the first and the last frame at their source, and what the last one is.
+    frames: Option<(u64, u64, String)>,
 }
 
 /// Runs the verb. Without `--count` it ends when it is interrupted.
@@ -48,6 +50,7 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
                 if let Some(last) = last.replace(publish) {
                     intervals.ns.push(publish.saturating_sub(last));
                 }
+                intervals.note_frame(&seen.value);
                 seen_any = true;
             }
         }
@@ -76,19 +79,34 @@ impl Intervals {
         (total > 0.0).then(|| f64::from(count) / total)
     }
 
+    fn note_frame(&mut self, value: &Value) {
+        let Some((frame, fields)) = value["frame"].as_u64().zip(value["fields"].as_array()) else {
+            return;
+        };
+        let fields: Vec<_> = fields.iter().filter_map(Value::as_str).collect();
+        let first = self.frames.take().map_or(frame, |(first, ..)| first);
+        self.frames = Some((first, frame, fields.join(" + ")));
+    }
+
     fn bounds(&self) -> Option<(u64, u64)> {
         Some((*self.ns.iter().min()?, *self.ns.iter().max()?))
     }
 
     fn text(&self, missed: u64) -> String {
         match self.bounds() {
-            Some((least, most)) => format!(
-                "{}   interval {} to {}   {} samples   {missed} missed",
-                rate(self.rate()),
-                span(least),
-                span(most),
-                self.ns.len(),
-            ),
+            Some((least, most)) => {
+                let mut text = format!(
+                    "{}   interval {} to {}   {} samples   {missed} missed",
+                    rate(self.rate()),
+                    span(least),
+                    span(most),
+                    self.ns.len(),
+                );
+                if let Some((first, last, fields)) = &self.frames {
+                    text.push_str(&format!("   frames {first} to {last}, {fields}"));
+                }
+                text
+            }
             None => "nothing in the last second".to_owned(),
         }
     }
@@ -102,6 +120,9 @@ impl Intervals {
             "interval_max_ns": bounds.map(|(_, most)| most),
             "samples": self.ns.len(),
             "missed": missed,
+            "first_frame": self.frames.as_ref().map(|(first, ..)| first),
+            "last_frame": self.frames.as_ref().map(|(_, last, _)| last),
+            "fields": self.frames.as_ref().map(|(.., fields)| fields),
         })
     }
 }
@@ -117,11 +138,21 @@ mod tests {
     fn the_rate_is_the_mean_and_the_bounds_are_kept() {
         let intervals = Intervals {
             ns: vec![90_000_000, 110_000_000],
+            ..Intervals::default()
         };
 
         assert_eq!(
             intervals.text(1),
             "10.0 Hz   interval 90.0 ms to 110 ms   2 samples   1 missed"
+        );
+        let mut of_frames = intervals;
+        for frame in [7, 9] {
+            of_frames.note_frame(&json!({ "frame": frame, "fields": ["640x480 I420"] }));
+        }
+        assert!(
+            of_frames
+                .text(1)
+                .ends_with("1 missed   frames 7 to 9, 640x480 I420")
         );
         assert_eq!(Intervals::default().text(0), "nothing in the last second");
     }

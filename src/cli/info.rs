@@ -1,14 +1,18 @@
 //! `ddx info`: one item in full.
 
-use ddx_store::{Description, ReaderEntry, Store};
+use std::time::Duration;
+
+use ddx_store::{Description, ReaderEntry, ReaderOptions, Store};
 use ddx_wire::{HostName, Pattern};
 use serde_json::{Value, json};
 
 use super::books::Books;
 use super::ls::{elapsed_ns, object, writer};
 use super::render::{Table, bytes, span};
+use super::subscription::Subscription;
 use super::{Context, state};
 use crate::error::{Exit, Hint as _, Outcome};
+use crate::video;
 
 /// Which item.
 #[derive(Debug, clap::Args)]
@@ -38,14 +42,61 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
             );
             fields.insert("path".to_owned(), json!(item.note));
             fields.insert("ways".to_owned(), json!(travels(&store, &item)?));
+            fields.insert("stream".to_owned(), stream(&store, &item)?);
         }
         context.out.object(&all)?;
         return Ok(Exit::Done);
     }
+    let about = stream(&store, &item)?;
     for line in lines(&item, store.host(), &travels(&store, &item)?) {
         context.out.line(&line)?;
     }
+    for line in stream_lines(&about) {
+        context.out.line(&line)?;
+    }
     Ok(Exit::Done)
+}
+
+/// What `NAME/info` says of a stream of video; null of other items, and where nothing is heard of it.
+fn stream(store: &Store, item: &Description) -> anyhow::Result<Value> {
+    if item.entry.schema_hash != video::schema()?.hash() {
+        return Ok(Value::Null);
+    }
+    let name = format!("{}/info", item.entry.name);
+    let mut about = Subscription::open(store, &name, ReaderOptions::default())?;
+    let seen = about.first(PATIENCE)?;
+    Ok(seen.map_or(Value::Null, |seen| seen.value.clone()))
+}
+
+fn stream_lines(about: &Value) -> Vec<String> {
+    let text = |value: &Value| value.as_str().unwrap_or("?").to_owned();
+    let mut lines = Vec::new();
+    if about.is_null() {
+        return lines;
+    }
+    lines.push(format!("source    {}", text(&about["source"])));
+    for field in about["fields"].as_array().into_iter().flatten() {
+        lines.push(format!(
+            "field     {}: {}x{} {}, captured as {}, {} range, {}, {} siting, {}",
+            text(&field["name"]),
+            field["width"],
+            field["height"],
+            text(&field["format"]),
+            text(&field["native"]),
+            text(&field["range"]).to_lowercase(),
+            text(&field["matrix"]),
+            text(&field["siting"]).to_lowercase(),
+            text(&field["scan"]).to_lowercase(),
+        ));
+    }
+    let parameters = about["parameters"].as_object();
+    for (name, value) in parameters.into_iter().flatten() {
+        lines.push(format!(
+            "parameter {name} = {value}, from frame {}",
+            about["from_frame"]
+        ));
+    }
+    lines
 }
 
 /// Each way of the item between this host and another: which, since when and why, and what its link carries.
@@ -137,3 +188,6 @@ fn reader_object(reader: &ReaderEntry) -> Value {
         "refused": reader.refused,
     })
 }
+
+/// How long it may take until another host has told what its stream is.
+const PATIENCE: Duration = Duration::from_secs(1);

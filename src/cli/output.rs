@@ -70,6 +70,12 @@ impl Output {
         self.write(&text)
     }
 
+    /// Writes what a terminal is to obey.
+    pub(crate) fn raw(&mut self, text: &str) -> anyhow::Result<()> {
+        self.drawn = 0;
+        self.write(text)
+    }
+
     #[expect(
         clippy::unused_self,
         reason = "whoever prints must hold the output, so that nobody prints in between"

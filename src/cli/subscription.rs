@@ -8,6 +8,7 @@ use ddx_wire::Time;
 use serde_json::{Value, json};
 
 use super::render;
+use crate::video;
 
 /// A reader of one item.
 #[derive(Debug)]
@@ -160,8 +161,11 @@ impl Tally {
     }
 }
 
-/// A payload that does not fit its schema is shown as the fault that it is.
+/// A payload that does not fit its schema is shown as the fault that it is; of a frame, what its header says.
 fn decode(schema: &Schema, payload: &[u8]) -> Value {
+    if video::is_stream(schema) {
+        return video::summary(payload);
+    }
     schema
         .to_json(payload)
         .unwrap_or_else(|fault| json!({ "undecodable": fault.to_string() }))

@@ -3,12 +3,17 @@
 mod load;
 mod pattern;
 mod save;
+mod serve;
+mod snap;
+mod view;
 
 use std::time::Duration;
 
+use ddx_video::frame::{Field, Frame};
+
 use super::Context;
 use super::interrupt::SLICE;
-use crate::error::Outcome;
+use crate::error::{Failure, Outcome};
 use crate::video::play::Lateness;
 
 /// What to do.
@@ -20,6 +25,12 @@ pub(crate) enum Verb {
     Pattern(pattern::Args),
     /// Record a stream to a Y4M file, bit for bit
     Save(save::Args),
+    /// Show the streams of the domain in a browser
+    Serve(serve::Args),
+    /// Save the present frame as a picture
+    Snap(snap::Args),
+    /// Show a stream in the terminal
+    View(view::Args),
 }
 
 /// Runs the verb.
@@ -28,7 +39,25 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         Verb::Load(args) => load::run(context, args),
         Verb::Pattern(args) => pattern::run(context, args),
         Verb::Save(args) => save::run(context, args),
+        Verb::Serve(args) => serve::run(context, args),
+        Verb::Snap(args) => snap::run(context, args),
+        Verb::View(args) => view::run(context, args),
     }
+}
+
+/// The field of that name, or the first.
+fn field<'a>(frame: &Frame<'a>, name: Option<&str>) -> Result<Field<'a>, Failure> {
+    let Some(name) = name else {
+        return Ok(frame.first());
+    };
+    frame.field(name).ok_or_else(|| {
+        let names: Vec<_> = frame
+            .fields()
+            .map(|field| field.info.name().to_owned())
+            .collect();
+        Failure::arguments(format!("the frame has no field `{name}`"))
+            .with_hint(format!("it has {}", names.join(", ")))
+    })
 }
 
 fn late(lateness: &Lateness) -> String {

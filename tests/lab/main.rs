@@ -13,6 +13,7 @@
 //! | `links.rs` | samples of every size cross emulated links whole and soon |
 //! | `paths.rs` | samples flow on when interfaces come, go and change address |
 //! | `radio.rs` | a link far too slow is shared by priority; multicast is given up where it is broken, and taken up again |
+//! | `video.rs` | video crosses a link bit for bit, and only while somebody looks |
 //! | `why.rs`, `why_flow.rs` | `ddx why` names the cause |
 
 #![expect(
@@ -32,5 +33,6 @@ mod paths;
 mod program;
 mod radio;
 mod site;
+mod video;
 mod why;
 mod why_flow;

@@ -72,6 +72,12 @@ pub enum Error {
     /// Something else stands where a frame should begin.
     #[error("it is damaged: frame {0} does not begin with `FRAME`")]
     NoFrame(u64),
+    /// No kind of picture file has names that end so.
+    #[error("`{0}` is no kind of picture (hint: ppm, png, jpg or tiff)")]
+    Picture(String),
+    /// A kind of picture file that does not take the picture.
+    #[error("it cannot be written so: {0}")]
+    Encode(String),
     /// The input cannot be read.
     #[error("reading it: {0}")]
     Read(#[source] io::Error),

@@ -5,10 +5,13 @@
 //! views (`cam@320x240,rgb,10Hz`) is reserved by keeping `@` out of the middle of a chunk of a video item's name.
 
 mod components;
+pub mod convert;
 mod error;
 pub mod format;
 pub mod frame;
 pub mod pattern;
+pub mod picture;
+pub mod scale;
 pub mod y4m;
 
 use ddx_wire::ItemName;

@@ -79,7 +79,7 @@ fn save(
     interrupt: &Interrupt,
     sink: impl Sink,
 ) -> Result<Report, Failure> {
-    let mut stream = StreamReader::open(store, &args.name, Delivery::Every)?;
+    let mut stream = StreamReader::open(store, &args.name, Delivery::Every, None)?;
     let mut sink = Some(sink);
     let mut recorder: Option<Recorder> = None;
     let mut report = Report::default();

@@ -1,0 +1,122 @@
+//! Video crosses a link bit for bit, and only while somebody looks.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::process::Command;
+use std::time::Duration;
+
+use ddx_rig::lab::{Loss, Process};
+use ddx_video::y4m::Reader;
+
+use crate::site::{PATIENCE, SAMPLES, Site, row};
+
+#[test]
+fn video_arrives_bit_for_bit_however_many_datagrams_are_lost() {
+    let Some(mut site) = Site::new(&["robot1", "base"]) else {
+        return;
+    };
+    row("picture    loss %   frames   sent/picture bytes");
+    for (size, frames, rate) in [("640x480", 60, "30 Hz"), ("1080p", 15, "15 Hz")] {
+        // Some pass before the reader's wish is known on the robot.
+        record(&site, size, 2 * frames);
+        let played = frames_of(&mut site, "robot1", "a.y4m");
+        for percent in [0, 1, 5] {
+            let loss = Loss {
+                to_percent: percent,
+                ..Loss::default()
+            };
+            site.lab.host("base").set_loss(loss).unwrap();
+            let before = site.counters();
+            let save = format!("video save robot1/again --output /run/b.y4m --frames {frames}");
+            let mut saving = background(&site, "base", &save);
+            let load = format!("video load /run/a.y4m --name again --rate '{rate}'");
+            let mut loading = background(&site, "robot1", &load);
+            let status = saving.wait(RECORDED).unwrap();
+            assert!(status.success(), "{} {}", saving.output(), saving.errors());
+            let sent = site.counters().since(&before);
+            loading.terminate(PATIENCE).unwrap();
+
+            let saved = frames_of(&mut site, "base", "b.y4m");
+            assert_eq!(saved.len(), frames);
+            let mut bytes = 0;
+            for ((number, frame), expected) in saved.iter().zip(saved[0].0..) {
+                assert_eq!(*number, expected, "{size} at {percent} %");
+                let same = played
+                    .iter()
+                    .any(|other| *other == (*number, frame.clone()));
+                assert!(same, "frame {number} of {size} at {percent} % is another");
+                bytes += frame.len();
+            }
+            let sent = f64::from(u32::try_from(sent.udp(SAMPLES, "robot1").from.bytes).unwrap());
+            let per_byte = sent / f64::from(u32::try_from(bytes).unwrap());
+            row(&format!(
+                "{size:<10} {percent:>6} {frames:>8} {per_byte:>13.3}"
+            ));
+        }
+        site.lab.host("base").set_loss(Loss::default()).unwrap();
+    }
+}
+
+#[test]
+fn video_is_sent_only_while_somebody_looks() {
+    let Some(site) = Site::new(&["robot1", "base"]) else {
+        return;
+    };
+    let mut camera = background(&site, "robot1", "video pattern --name cam --size qvga");
+    site.wait_listed("base", "robot1/cam", true);
+    let before = site.counters();
+    // Two seconds of video on its own host.
+    site.ddx("robot1", &["hz", "robot1/cam", "--count", "2"]);
+    let sent = |before| {
+        site.counters()
+            .since(before)
+            .udp(SAMPLES, "robot1")
+            .from
+            .bytes
+    };
+    assert_eq!(sent(&before), 0);
+
+    let seen = site.ddx("base", &["hz", "robot1/cam", "--count", "2"]);
+    let rate = seen[1]["rate_hz"].as_f64().unwrap();
+    assert!((25.0..35.0).contains(&rate), "{seen:?}");
+    assert_eq!(seen[1]["fields"], "320x240 I420", "{seen:?}");
+    assert!(sent(&before) > 30 * 320 * 240, "{seen:?}");
+    let about = &site.ddx("base", &["info", "robot1/cam"])[0]["stream"];
+    assert_eq!(about["source"], "pattern", "{about}");
+
+    site.wait_quiet("robot1");
+    camera.terminate(PATIENCE).unwrap();
+}
+
+/// Makes `/run/a.y4m` on the robot.
+fn record(site: &Site, size: &str, frames: usize) {
+    let pattern = format!("video pattern --name cam --size {size} --rate 30");
+    let mut camera = background(site, "robot1", &pattern);
+    let frames = frames.to_string();
+    let save = ["video", "save", "cam", "--output", "/run/a.y4m", "--frames"];
+    let saved = site.ddx("robot1", &[&save[..], &[&frames]].concat());
+    assert_eq!(saved[0]["missed"], 0, "{saved:?}");
+    camera.terminate(PATIENCE).unwrap();
+}
+
+fn background(site: &Site, host: &str, line: &str) -> Process {
+    let mut command = Command::new("sh");
+    let ddx = env!("CARGO_BIN_EXE_ddx");
+    command.args(["-c", &format!("exec {ddx} --json {line}")]);
+    site.lab.host(host).spawn(&command).unwrap()
+}
+
+/// The frames of a file in a host's `/run`, with their numbers at their source.
+fn frames_of(site: &mut Site, host: &str, file: &str) -> Vec<(u64, Vec<u8>)> {
+    let path = format!("/proc/{}/root/run/{file}", site.pid(host));
+    let mut reader = Reader::new(BufReader::new(File::open(path).unwrap())).unwrap();
+    let mut frames = Vec::new();
+    let mut frame = vec![0; reader.layout().size_bytes()];
+    while let Some(mark) = reader.next_mark().unwrap() {
+        reader.read_planes(&mut frame).unwrap();
+        frames.push((mark.sequence.unwrap(), frame.clone()));
+    }
+    frames
+}
+
+const RECORDED: Duration = Duration::from_secs(30);
