@@ -153,9 +153,9 @@ impl StreamWriter {
         self.frames.readers()
     }
 
-    /// Whether each of them has read the newest frame.
+    /// Whether each of them has read the newest frame; one that was there before this writer is not waited for.
     pub(crate) fn is_consumed(&self) -> bool {
-        self.frames.is_consumed()
+        self.samples == 0 || self.frames.is_consumed()
     }
 }
 

@@ -433,6 +433,25 @@ fn a_video_that_is_played_is_recorded_bit_for_bit() {
 }
 
 #[test]
+fn a_recording_begins_with_what_is_played_and_not_with_what_was_played() {
+    let daemon = Daemon::start(&[]);
+    let (played, recorded) = (daemon.dir.0.join("a.y4m"), daemon.dir.0.join("b.y4m"));
+    fs::write(&played, video(5)).unwrap();
+    let (played, recorded) = (played.to_str().unwrap(), recorded.to_str().unwrap());
+    let load = ["video", "load", played, "--name", "cam"];
+    daemon.json(&[&load[..], &["--rate", "1 kHz"]].concat());
+
+    let save = [
+        "video", "save", "cam", "--output", recorded, "--frames", "5",
+    ];
+    let mut saving = daemon.background(&save);
+    daemon.json(&[&load[..], &["--lockstep"]].concat());
+
+    assert_eq!(saving.0.wait().unwrap().code(), Some(0));
+    assert_eq!(fs::read(recorded).unwrap(), fs::read(played).unwrap());
+}
+
+#[test]
 fn at_the_end_of_a_video_nobody_is_waited_for() {
     let daemon = Daemon::start(&[]);
     let path = daemon.dir.0.join("a.y4m");
@@ -563,10 +582,11 @@ fn a_browser_is_shown_streams_and_the_page_of_a_stranger_is_not() {
     let has = |answer: &[u8], part: &[u8]| answer.windows(part.len()).any(|seen| seen == part);
 
     assert!(has(&whole("/", address), b"<!doctype html>"));
-    let streams = whole("/streams", address);
-    assert!(has(&streams, b"robot1/cam"), "{}", lossy(&streams));
+    // It waits for the first frame.
     let png = whole("/snap.png?name=robot1/cam", address);
     assert!(has(&png, b"image/png") && has(&png, b"\x89PNG"));
+    let streams = whole("/streams", address);
+    assert!(has(&streams, b"robot1/cam"), "{}", lossy(&streams));
     for (path, expected) in [
         ("/snap.png", b"HTTP/1.1 400".as_slice()),
         ("/movie?name=robot1/cam&rate=0", b"HTTP/1.1 400"),

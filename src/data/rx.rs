@@ -1,7 +1,7 @@
 //! The thread that receives samples: sockets in, mirrors out.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::net::UdpSocket;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
@@ -83,6 +83,8 @@ pub(crate) enum Notice {
     Report(Tag, ReportEntry),
     /// What is missing.
     Nack(Tag, NackEntry),
+    /// A mirror is closed: its item may be mirrored anew.
+    Closed(MirrorId),
     /// The receiver's counters, once a second while something arrives.
     Counters(Box<ReceiverCounters>),
 }
@@ -98,6 +100,8 @@ struct State {
     receiver: Receiver,
     inbound: Inbound,
     notices: mailbox::Sender<Notice>,
+    /// Mirrors whose end has not been told yet.
+    closed: VecDeque<MirrorId>,
     told: Time,
     board: Arc<Board>,
     shown: Time,
@@ -172,6 +176,7 @@ impl Rx {
                 traffic,
             },
             notices,
+            closed: VecDeque::new(),
             told: now,
             board,
             shown: now,
@@ -308,6 +313,7 @@ impl State {
                 self.inbound
                     .streams
                     .retain(|_key, stream| stream.mirror != mirror);
+                self.closed.push_back(mirror);
             }
             Order::RoundTrip { tag, time } => self.receiver.round_trip(tag, time),
             Order::Expect {
@@ -374,6 +380,11 @@ impl State {
             if self.notices.send(notice).is_err() {
                 count(&self.inbound.traffic.untold_notices, 1);
             }
+        }
+        while let Some(mirror) = self.closed.front()
+            && self.notices.send(Notice::Closed(*mirror)).is_ok()
+        {
+            self.closed.pop_front();
         }
         if now.since(self.shown) >= board::PERIOD {
             self.shown = now;

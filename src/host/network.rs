@@ -77,13 +77,33 @@ pub(super) struct Network {
     remote_changed: bool,
     mirrors: BTreeMap<ItemName, Mirror>,
     last_mirror: u64,
+    /// Mirrors that the receiving thread still holds, and what waits for the item to be free.
+    closing: BTreeMap<MirrorId, ItemName>,
+    awaited: BTreeMap<ItemName, Expected>,
     reincarnate: Option<u32>,
+}
+
+/// A stream that is to be mirrored.
+struct Expected {
+    stream: (Tag, StreamId),
+    description: ItemDescription,
+    contract: Contract,
 }
 
 struct Mirror {
     id: MirrorId,
     description: ItemDescription,
     stream: Option<(Tag, StreamId)>,
+    contract: Contract,
+}
+
+impl Mirror {
+    /// Whether samples of an item that is so described have room in it.
+    fn fits(&self, description: &ItemDescription) -> bool {
+        self.description.schema_hash == description.schema_hash
+            && self.description.capacity_bytes == description.capacity_bytes
+            && self.description.depth == description.depth
+    }
 }
 
 impl Network {
@@ -198,6 +218,8 @@ impl Network {
             remote_changed: false,
             mirrors: BTreeMap::new(),
             last_mirror: 0,
+            closing: BTreeMap::new(),
+            awaited: BTreeMap::new(),
             reincarnate: None,
         })
     }
@@ -217,7 +239,7 @@ impl Network {
             () = sleep(wait.unwrap_or_default()), if wait.is_some() => self.catalog.handle_timeout(ddx_store::now()),
         }
         self.receive();
-        self.take_notices();
+        self.take_notices()?;
         self.settle()?;
         Ok(self.reincarnate.take())
     }
@@ -377,7 +399,7 @@ impl Network {
         }
     }
 
-    fn take_notices(&mut self) {
+    fn take_notices(&mut self) -> anyhow::Result<()> {
         // Tells the runtime that the descriptor was emptied; the queue itself is what counts.
         self.notified
             .try_io(Interest::READABLE, || {
@@ -403,9 +425,11 @@ impl Network {
                     self.catalog.report(tag, report, ddx_store::now());
                 }
                 rx::Notice::Nack(tag, nack) => self.catalog.nack(tag, nack, ddx_store::now()),
+                rx::Notice::Closed(mirror) => self.mirror_closed(mirror)?,
                 rx::Notice::Counters(counters) => self.received = *counters,
             }
         }
+        Ok(())
     }
 
     /// Drains all effects of the last mutation.
@@ -486,8 +510,19 @@ impl Network {
                     },
                     schema: schema_text,
                 };
-                self.remote.insert((name, host), item);
+                let description = item.description.clone();
+                self.remote.insert((name.clone(), host), item);
                 self.remote_changed = true;
+                // A new writer may write larger samples, in the stream that flows already.
+                if let Some(expected) = self.awaited.get_mut(&name) {
+                    expected.description = description;
+                } else if let Some(mirror) = self.mirrors.get(&name)
+                    && !mirror.fits(&description)
+                    && let Some(stream) = mirror.stream
+                {
+                    let contract = mirror.contract;
+                    self.expect_stream(stream, &name, description, contract)?;
+                }
             }
             Event::ItemGone { host, name } => {
                 self.remote_changed |= self.remote.remove(&(name.clone(), host)).is_some();
@@ -542,6 +577,8 @@ impl Network {
                 {
                     mirror.stream = None;
                 }
+                self.awaited
+                    .retain(|_name, expected| expected.stream != (tag, stream));
                 self.rx.order(rx::Order::Forget { tag, stream })?;
             }
             Event::JoinGroup(group) => {
@@ -607,17 +644,23 @@ impl Network {
         description: ItemDescription,
         contract: Contract,
     ) -> anyhow::Result<()> {
-        let fits = |mirror: &Mirror| {
-            mirror.description.schema_hash == description.schema_hash
-                && mirror.description.capacity_bytes == description.capacity_bytes
-                && mirror.description.depth == description.depth
-        };
-        if self.mirrors.get(name).is_some_and(|mirror| !fits(mirror)) {
+        let mirror = self.mirrors.get(name);
+        if mirror.is_some_and(|mirror| !mirror.fits(&description)) {
             self.drop_mirror(name)?;
+        }
+        if self.closing.values().any(|closing| closing == name) {
+            let expected = Expected {
+                stream: (tag, stream),
+                description,
+                contract,
+            };
+            self.awaited.insert(name.clone(), expected);
+            return Ok(());
         }
         let id = match self.mirrors.get_mut(name) {
             Some(mirror) => {
                 mirror.stream = Some((tag, stream));
+                mirror.contract = contract;
                 mirror.id
             }
             None => match self.open_mirror(name, description, contract, (tag, stream)) {
@@ -676,16 +719,34 @@ impl Network {
                 id,
                 description,
                 stream: Some(stream),
+                contract,
             },
         );
         Ok(id)
     }
 
-    fn drop_mirror(&mut self, name: &ItemName) -> anyhow::Result<()> {
-        match self.mirrors.remove(name) {
-            Some(mirror) => self.rx.order(rx::Order::DropMirror(mirror.id)),
+    /// Goes on with what waited for a mirror's end.
+    fn mirror_closed(&mut self, mirror: MirrorId) -> anyhow::Result<()> {
+        let Some(name) = self.closing.remove(&mirror) else {
+            return Ok(());
+        };
+        match self.awaited.remove(&name) {
+            Some(Expected {
+                stream,
+                description,
+                contract,
+            }) => self.expect_stream(stream, &name, description, contract),
             None => Ok(()),
         }
+    }
+
+    fn drop_mirror(&mut self, name: &ItemName) -> anyhow::Result<()> {
+        self.awaited.remove(name);
+        let Some(mirror) = self.mirrors.remove(name) else {
+            return Ok(());
+        };
+        self.closing.insert(mirror.id, name.clone());
+        self.rx.order(rx::Order::DropMirror(mirror.id))
     }
 
     /// What the hosts that show this name say of it.

@@ -1,4 +1,4 @@
-//! `ddx video save`: a stream to a Y4M file, bit for bit.
+//! `ddx video save`: a stream from now on to a Y4M file, bit for bit.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -79,6 +79,7 @@ fn save(
     interrupt: &Interrupt,
     sink: impl Sink,
 ) -> Result<Report, Failure> {
+    let opened = ddx_store::now();
     let mut stream = StreamReader::open(store, &args.name, Delivery::Every, None)?;
     let mut sink = Some(sink);
     let mut recorder: Option<Recorder> = None;
@@ -98,6 +99,10 @@ fn save(
             }
             continue;
         };
+        if taken == 0 && guard.meta().publish < opened {
+            // It may be the last one of a source that has ended long ago.
+            continue;
+        }
         let frame = frame(&guard)?;
         let info = *frame.info();
         if let Some(sink) = sink.take() {
