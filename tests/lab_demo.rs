@@ -3,8 +3,10 @@
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::fs;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::PathBuf;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 
@@ -51,9 +53,12 @@ fn the_show_sends_nothing_unread_and_recovers_twice() {
     let summary = summary(&demo(&dir, &["--json", "--seconds", "12"]));
 
     assert_eq!(summary["event"], "summary");
-    assert_eq!(summary["items"], 7);
+    // The three of the video without what it is made of.
+    assert_eq!(summary["items"], 9);
     assert_eq!(summary["sample_bytes_before_reading"], 0);
-    assert!(summary["sample_bytes"].as_u64().unwrap() > 0, "{summary}");
+    let bytes = |key: &str| summary[key].as_u64().unwrap();
+    let (unseen, all) = (bytes("sample_bytes_before_looking"), bytes("sample_bytes"));
+    assert!(unseen > 0 && all > 20 * unseen, "{summary}");
     assert_eq!(summary["recovered"], true, "{summary}");
     assert_eq!(
         summary["recovered_s"].as_object().unwrap().len(),
@@ -76,4 +81,45 @@ fn a_short_show_leaves_the_failures_out() {
         "{summary}"
     );
     assert!(String::from_utf8_lossy(&shown.stderr).contains("--seconds 12"));
+}
+
+#[test]
+fn a_browser_outside_sees_the_video_as_base_does() {
+    let dir = Dir::new("served");
+    let mut demo = Command::new(env!("CARGO_BIN_EXE_ddx"))
+        .args(["demo", "--json", "--serve"])
+        .env("TMPDIR", &dir.0)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(demo.stdout.take().unwrap()).lines();
+    let url = loop {
+        let said: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
+        if said["event"] == "served" {
+            break said["url"].as_str().unwrap().to_owned();
+        }
+    };
+    let address = url.split('/').nth(2).unwrap();
+    let mut server = TcpStream::connect(address).unwrap();
+    let request = "GET /snap.png?name=robot1/cam HTTP/1.1";
+    write!(
+        server,
+        "{request}\r\nHost: {address}\r\nConnection: close\r\n\r\n"
+    )
+    .unwrap();
+    let mut answer = Vec::new();
+    server.read_to_end(&mut answer).unwrap();
+    let pid = demo.id().to_string();
+    let ended = Command::new("kill").args(["-TERM", &pid]).status().unwrap();
+    assert!(ended.success());
+    assert_eq!(demo.wait().unwrap().code(), Some(0));
+
+    assert!(
+        answer.starts_with(b"HTTP/1.1 200"),
+        "{}",
+        String::from_utf8_lossy(&answer)
+    );
+    assert!(answer.windows(4).any(|part| part == b"\x89PNG"));
+    assert_eq!(fs::read_dir(&dir.0).unwrap().count(), 0);
 }

@@ -1,7 +1,7 @@
 //! `ddx demo`: two hosts, the link between them, and its failures, on screen.
 //!
-//! The acts: nobody reads, and nothing crosses; base reads; the link is cut and healed; robot1 is killed and started
-//! again. Both must recover, or the exit code is 1.
+//! The acts: nobody reads, and nothing crosses; base reads; base looks at robot1's video too; the link is cut and healed;
+//! robot1 is killed and started again. Both must recover, or the exit code is 1.
 
 mod show;
 mod stage;
@@ -21,13 +21,21 @@ use crate::error::{Exit, Failure, Outcome};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Length of the show; below 12 the failures are left out; 0 starts the hosts and stays, for you to look round
-    #[arg(long, value_name = "N", default_value_t = 20)]
-    seconds: u32,
+    /// [default: 20, or 0 with `--serve`]
+    #[arg(long, value_name = "N")]
+    seconds: Option<u32>,
+    /// Show robot1's video, as base sees it, in a browser
+    #[arg(long)]
+    serve: bool,
 }
 
 /// Runs the verb.
 pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
-    stage::enter_user_namespace();
+    if !args.serve {
+        // The browser is not in there.
+        stage::enter_user_namespace();
+    }
+    let seconds = args.seconds.unwrap_or(if args.serve { 0 } else { 20 });
     let interrupt = Interrupt::listen(context.tethered)?;
     let mut stage = Stage::build()?;
     let (ground, text) = match &stage.ground {
@@ -47,21 +55,29 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         &json!({ "event": "ground", "ground": ground, "text": text }),
         &text,
     )?;
-    if args.seconds == 0 {
+    if args.serve {
+        let url = stage.start_server()?;
+        context.out.either(
+            &json!({ "event": "served", "url": url }),
+            &format!("robot1's video, as base sees it: {url}"),
+        )?;
+    }
+    if seconds == 0 {
         return stay(context, &stage, &interrupt);
     }
-    let acts = if args.seconds < WHOLE_S {
+    let acts = if seconds < WHOLE_S {
         &ACTS[..UNBROKEN]
     } else {
         &ACTS[..]
     };
-    let scale = f64::from(args.seconds) / acts.iter().map(|act| act.seconds).sum::<f64>();
+    let scale = f64::from(seconds) / acts.iter().map(|act| act.seconds).sum::<f64>();
     let mut show = Show::new(&mut context.out, &stage, interrupt.clone())?;
     for act in acts {
         show.enter(act.key, act.text)?;
         match act.deed {
             Deed::Look => {}
-            Deed::Read => show.subscribe()?,
+            Deed::Read => show.subscribe(|name| name != VIDEO)?,
+            Deed::See => show.subscribe(|name| name == VIDEO)?,
             Deed::Cut => stage.cut()?,
             Deed::Heal => stage.heal()?,
             Deed::Kill => {
@@ -118,13 +134,14 @@ struct Act {
 enum Deed {
     Look,
     Read,
+    See,
     Cut,
     Heal,
     Kill,
     Start,
 }
 
-const ACTS: [Act; 6] = [
+const ACTS: [Act; 7] = [
     Act {
         key: "unread",
         text: "robot1 publishes, nobody reads: no sample crosses the link",
@@ -133,9 +150,15 @@ const ACTS: [Act; 6] = [
     },
     Act {
         key: "read",
-        text: "base reads robot1/**",
+        text: "base reads robot1/**, all but the video",
         deed: Deed::Read,
-        seconds: 5.0,
+        seconds: 3.0,
+    },
+    Act {
+        key: "seen",
+        text: "base looks at robot1/cam",
+        deed: Deed::See,
+        seconds: 3.0,
     },
     Act {
         key: "cut",
@@ -162,7 +185,9 @@ const ACTS: [Act; 6] = [
         seconds: 4.0,
     },
 ];
+/// The frames of robot1.
+const VIDEO: &str = "robot1/cam";
 /// The acts in which nothing breaks come first.
-const UNBROKEN: usize = 2;
+const UNBROKEN: usize = 3;
 /// In a shorter show, a host that is gone would not be noticed before it is back.
 const WHOLE_S: u32 = 12;

@@ -37,10 +37,11 @@ struct Meter {
     newest: Option<u64>,
 }
 
-/// Bytes on the link until base read.
+/// Bytes on the link until base read, and until it looked at the video.
 #[derive(Default)]
 struct Crossed {
     samples_unread: Option<u64>,
+    samples_unseen: Option<u64>,
     link_unread: Option<u64>,
     link: Option<u64>,
 }
@@ -64,9 +65,11 @@ impl<'a> Show<'a> {
         let items = loop {
             let entries = base.list(&pattern)?;
             if entries.len() >= ITEMS {
+                // What a stream is made of is written once, and is not to be fresh again.
                 break entries
                     .into_iter()
                     .map(|entry| (entry.name.to_string(), None))
+                    .filter(|(name, _)| !name.ends_with("/info"))
                     .collect();
             }
             if Instant::now() >= deadline || interrupt.is_raised() {
@@ -107,11 +110,15 @@ impl<'a> Show<'a> {
         )
     }
 
-    /// Opens a reader on each item.
-    pub(super) fn subscribe(&mut self) -> anyhow::Result<()> {
-        self.crossed.samples_unread = self.meter.total();
-        self.crossed.link_unread = self.crossed.link;
-        for (name, subscription) in &mut self.items {
+    /// Opens a reader on each of these items.
+    pub(super) fn subscribe(&mut self, which: impl Fn(&str) -> bool) -> anyhow::Result<()> {
+        if self.crossed.samples_unread.is_none() {
+            self.crossed.samples_unread = self.meter.total();
+            self.crossed.link_unread = self.crossed.link;
+        } else {
+            self.crossed.samples_unseen = self.meter.total();
+        }
+        for (name, subscription) in self.items.iter_mut().filter(|(name, _)| which(name)) {
             *subscription = Some(Subscription::open(
                 &self.base,
                 name,
@@ -175,6 +182,7 @@ impl<'a> Show<'a> {
                 "missed": missed,
                 "left_out": left_out,
                 "sample_bytes_before_reading": self.crossed.samples_unread,
+                "sample_bytes_before_looking": self.crossed.samples_unseen,
                 "sample_bytes": samples,
                 "link_bytes_before_reading": self.crossed.link_unread,
                 "link_bytes": self.crossed.link,
@@ -185,15 +193,8 @@ impl<'a> Show<'a> {
         }
         self.out.line("--- summary")?;
         self.out.line(&format!("samples   {received} received, {missed} missed, {left_out} not sent while the link was down"))?;
-        self.out.line(&format!(
-            "crossed   {} of samples before base read, {} after",
-            known(self.crossed.samples_unread),
-            known(
-                samples
-                    .zip(self.crossed.samples_unread)
-                    .map(|(all, before)| all.saturating_sub(before))
-            ),
-        ))?;
+        self.out
+            .line(&format!("crossed   {}", self.crossed.text(samples)))?;
         for recovery in &self.recoveries {
             let took = recovery.took.map_or_else(
                 || "not every item came back".to_owned(),
@@ -305,19 +306,31 @@ impl<'a> Show<'a> {
             ]);
         }
         let mut lines = table.lines();
-        let before = self.crossed.samples_unread.or_else(|| self.meter.total());
-        let after = self
-            .meter
-            .total()
-            .zip(self.crossed.samples_unread)
-            .map(|(all, before)| all.saturating_sub(before));
         lines.push(format!(
-            "crossed the link: samples {} before base read, {} since; everything {}",
-            known(before),
-            known(after.or_else(|| self.crossed.samples_unread.is_none().then_some(0))),
+            "crossed the link: samples {}; everything {}",
+            self.crossed.text(self.meter.total()),
             known(self.crossed.link),
         ));
         lines
+    }
+}
+
+impl Crossed {
+    /// How many bytes of samples crossed in each part of the show, of so many until now.
+    fn text(&self, now: Option<u64>) -> String {
+        let (unread, unseen) = (self.samples_unread, self.samples_unseen);
+        let between = |from: Option<u64>, to: Option<u64>| {
+            known(from.zip(to).map(|(from, to)| to.saturating_sub(from)))
+        };
+        let mut text = format!("{} before base read", known(unread.or(now)));
+        if unread.is_some() {
+            let read = between(unread, unseen.or(now));
+            text.push_str(&format!(", {read} before it looked at the video"));
+        }
+        if unseen.is_some() {
+            text.push_str(&format!(", {} since", between(unseen, now)));
+        }
+        text
     }
 }
 
@@ -361,8 +374,8 @@ fn known(bytes: Option<u64>) -> String {
 
 /// The counter of robot1's bytes on its data socket.
 const SAMPLE_BYTES: &str = "data_sent_bytes";
-/// Items of robot1: four of the receiver, three of the machine.
-const ITEMS: usize = 7;
+/// Items of robot1: four of the receiver, three of the machine, three of the video.
+const ITEMS: usize = 10;
 /// Longest wait for base to know them.
 const PATIENCE: Duration = Duration::from_secs(10);
 const SLICE: Duration = Duration::from_millis(50);

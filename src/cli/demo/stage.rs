@@ -129,7 +129,25 @@ impl Stage {
             .start_program(nmea.map(OsString::from).into_iter().chain([log.into()]))?;
         let system = ["source", "system", "--name", "sys", "--rate", "10"];
         self.robot.start_program(system.map(OsString::from))?;
+        let video = [
+            "video", "pattern", "--name", "cam", "--size", "320x240", "--rate", "10",
+        ];
+        self.robot.start_program(video.map(OsString::from))?;
         Ok(seed)
+    }
+
+    /// Serves what base sees to a browser, which is outside of its namespace. Returns where.
+    pub(super) fn start_server(&mut self) -> anyhow::Result<String> {
+        let program = std::env::current_exe().context("find this program")?;
+        let mut command = self.base.prepared(Command::new(program))?;
+        command.args(["video", "serve", "--listen", SERVED]);
+        let (child, line) = first_line(command.stdout(Stdio::piped()))?;
+        let Ok(ready) = serde_json::from_str::<Value>(&line) else {
+            bail!("nothing is served: {}", self.base.last_words());
+        };
+        self.base.programs.push(child);
+        let url = ready["url"].as_str().unwrap_or_default();
+        Ok(format!("{url}#robot1%2Fcam"))
     }
 
     /// Kills all of the robot's processes at once, without a warning.
@@ -213,7 +231,11 @@ impl Actor {
 
     fn ddx(&self) -> anyhow::Result<Command> {
         let program = std::env::current_exe().context("find this program")?;
-        let mut command = self.command(program);
+        self.prepared(self.command(program))
+    }
+
+    /// Tells a `ddx` whose daemon is its own.
+    fn prepared(&self, mut command: Command) -> anyhow::Result<Command> {
         for (name, _) in std::env::vars_os() {
             if name.to_string_lossy().starts_with("DDX_") || name == "NOTIFY_SOCKET" {
                 command.env_remove(name);
@@ -246,16 +268,7 @@ impl Actor {
         if let Some(address) = join {
             command.args(["--join", &format!("udp/{address}")]);
         }
-        let mut child = Reaped(
-            command
-                .stdout(Stdio::piped())
-                .spawn()
-                .context("start `ddx up`")?,
-        );
-        let mut line = String::new();
-        if let Some(stdout) = child.0.stdout.take() {
-            BufReader::new(stdout).read_line(&mut line)?;
-        }
+        let (child, line) = first_line(command.stdout(Stdio::piped()))?;
         let Ok(ready) = serde_json::from_str::<Value>(&line) else {
             bail!("host {} did not start: {}", self.name, self.last_words());
         };
@@ -315,6 +328,16 @@ impl Actor {
             .find_map(|line| line.strip_prefix("error: "));
         error.unwrap_or("it said nothing").to_owned()
     }
+}
+
+/// Starts a program and waits for the first line that it prints.
+fn first_line(command: &mut Command) -> anyhow::Result<(Reaped, String)> {
+    let mut child = Reaped(command.spawn().context("start `ddx`")?);
+    let mut line = String::new();
+    if let Some(stdout) = child.0.stdout.take() {
+        BufReader::new(stdout).read_line(&mut line)?;
+    }
+    Ok((child, line))
 }
 
 /// Gives each host a namespace and joins the two by a virtual cable.
@@ -415,6 +438,8 @@ impl Drop for Reaped {
 /// Set in the user namespace, so that it is entered once.
 const INSIDE: &str = "DDX_DEMO_INSIDE";
 const PATIENCE: Duration = Duration::from_secs(2);
+/// Where a browser sees what base sees; whichever port is free, so that two shows do not meet.
+const SERVED: &str = "127.0.0.1:0";
 /// The real log of a GPS receiver; see `deploy/data/NOTICE`.
 const LOG: &[u8] = include_bytes!("../../../deploy/data/gps.nmea");
 
