@@ -1,9 +1,11 @@
 //! Streams of video in the store: their frames, what is known of their source, and a counter that travels where pictures do
 //! not.
 
+pub(crate) mod camera;
 pub(crate) mod play;
 pub(crate) mod recorder;
 pub(crate) mod terminal;
+pub(crate) mod v4l2;
 
 use anyhow::Context as _;
 use ddx_store::{

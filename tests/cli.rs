@@ -547,6 +547,87 @@ fn the_present_frame_is_a_picture_and_the_stream_is_known() {
 }
 
 #[test]
+fn streams_do_not_notice_who_stalls_or_dies_beside_them() {
+    let daemon = Daemon::start(&[]);
+    let pattern = |name: &str, fields: &str| {
+        let size = ["--size", "64x64", "--rate", "100"];
+        let verb = ["video", "pattern", "--name", name, "--fields", fields];
+        daemon.background(&[&verb[..], &size].concat())
+    };
+    let names = ["a", "b", "c", "d", "e"];
+    let _cameras = names.map(|name| pattern(name, "picture"));
+    let _pairs = ["stereo", "other"].map(|name| pattern(name, "left,range,right"));
+    // One that is killed, one that reads no further, and a source that is killed.
+    let killed = daemon.background(&["video", "save", "a", "--output", "/dev/null"]);
+    let stalled = daemon.background(&["video", "save", "stereo", "--output", "/dev/null"]);
+    let view = ["video", "view", "a", "--size", "9x9"];
+    let mut viewer = command(&view)
+        .env("DDX_SOCKET", daemon.socket())
+        .stdout(Stdio::piped())
+        .spawn()
+        .map(Background)
+        .unwrap();
+    let source = pattern("dies", "picture");
+    daemon.json(&["get", "robot1/dies/counter"]);
+    let stop = ["-STOP", &stalled.0.id().to_string()];
+    assert!(Command::new("kill").args(stop).status().unwrap().success());
+    drop((killed, source));
+
+    let saving: Vec<_> = names
+        .iter()
+        .chain(&["stereo", "other"])
+        .map(|name| {
+            let path = daemon.dir.0.join(format!("{name}.y4m"));
+            let output = ["--output", path.to_str().unwrap(), "--frames", "50"];
+            daemon.background(&[&["video", "save", name], &output[..]].concat())
+        })
+        .collect();
+    for mut saved in saving {
+        // 3 would say that frames were missed.
+        assert_eq!(saved.0.wait().unwrap().code(), Some(0));
+    }
+
+    assert_eq!(viewer.0.try_wait().unwrap(), None);
+    drop(viewer);
+    let stereo = fs::read(daemon.dir.0.join("stereo.y4m")).unwrap();
+    let mut reader = ddx_video::y4m::Reader::new(stereo.as_slice()).unwrap();
+    assert_eq!(reader.layout().fields().len(), 3);
+    let mut bytes = vec![0; reader.layout().size_bytes()];
+    let info = ddx_video::frame::FrameInfo::default();
+    while reader.next_mark().unwrap().is_some() {
+        reader.layout().write_header(&mut bytes, &info).unwrap();
+        reader.read_planes(&mut bytes).unwrap();
+        let frame = ddx_video::frame::Frame::parse(&bytes).unwrap();
+        let stamps: Vec<_> = frame
+            .fields()
+            .map(|field| ddx_video::pattern::read(&field).unwrap())
+            .collect();
+        assert!(stamps.iter().all(|stamp| *stamp == stamps[0]));
+    }
+}
+
+#[test]
+fn the_example_of_a_camera_a_viewer_and_a_recording_works() {
+    let dir = Dir::new();
+    let example = concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/examples/camera");
+    let ddx = Path::new(env!("CARGO_BIN_EXE_ddx")).parent().unwrap();
+    let path = std::env::var("PATH").unwrap();
+    let ran = Command::new(example)
+        .arg(&dir.0)
+        .env("PATH", format!("{}:{path}", ddx.display()))
+        .stdin(Stdio::null())
+        .output()
+        .unwrap();
+
+    let said = lossy(&ran.stdout);
+    assert_eq!(code(&ran), 0, "{said}{}", lossy(&ran.stderr));
+    assert!(said.contains("352x288 I420"), "{said}");
+    assert!(said.contains("10 frames"), "{said}");
+    let recorded = fs::read(dir.0.join("video.y4m")).unwrap();
+    assert!(recorded.starts_with(b"YUV4MPEG2 W352 H288"));
+}
+
+#[test]
 fn a_browser_is_shown_streams_and_the_page_of_a_stranger_is_not() {
     let daemon = Daemon::start(&[]);
     let pattern = ["video", "pattern", "--name", "cam", "--size", "64x64"];

@@ -5,6 +5,7 @@ mod pattern;
 mod save;
 mod serve;
 mod snap;
+mod v4l2;
 mod view;
 
 use std::time::Duration;
@@ -23,6 +24,8 @@ pub(crate) enum Verb {
     Load(load::Args),
     /// Publish a moving picture that carries its number and time
     Pattern(pattern::Args),
+    /// Publish a camera while somebody reads
+    V4l2(v4l2::Args),
     /// Record a stream to a Y4M file, bit for bit
     Save(save::Args),
     /// Show the streams of the domain in a browser
@@ -38,6 +41,7 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
     match verb {
         Verb::Load(args) => load::run(context, args),
         Verb::Pattern(args) => pattern::run(context, args),
+        Verb::V4l2(args) => v4l2::run(context, args),
         Verb::Save(args) => save::run(context, args),
         Verb::Serve(args) => serve::run(context, args),
         Verb::Snap(args) => snap::run(context, args),

@@ -9,6 +9,7 @@ pub mod convert;
 mod error;
 pub mod format;
 pub mod frame;
+pub mod gather;
 pub mod pattern;
 pub mod picture;
 pub mod scale;

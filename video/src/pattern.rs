@@ -1,4 +1,4 @@
-//! A moving picture for tests, which carries its number and its capture time where lossy coding and scaling leave them
+//! Moving pictures for tests, each of which carries its number and its capture time where lossy coding and scaling leave them
 //! readable.
 //!
 //! The upper half is a grid of 16 by 8 cells, each black or white, read from the left and from the top. The first two are
@@ -29,15 +29,19 @@ pub struct Pattern {
 }
 
 impl Pattern {
-    /// A stream of pictures of one size.
+    /// A stream of frames with pictures of one size, one of each name.
     ///
     /// # Errors
-    /// [`Error::Size`] below 64x64 pixels, where the cells would be too small to be read back, and for what no frame can be.
-    pub fn new(width: u32, height: u32) -> Result<Self, Error> {
+    /// [`Error::Size`] below 64x64 pixels, where the cells would be too small to be read back, and for what no frame can be;
+    /// [`Error::Fields`] and [`Error::FieldName`].
+    pub fn new(width: u32, height: u32, fields: &[&str]) -> Result<Self, Error> {
         if width < SIDE_MIN || height < SIDE_MIN {
             return Err(Error::Size { width, height });
         }
-        let layout = Layout::new(&[FieldSpec::new("picture", PixelFormat::I420, width, height)])?;
+        let specs = fields
+            .iter()
+            .map(|name| FieldSpec::new(name, PixelFormat::I420, width, height));
+        let layout = Layout::new(&specs.collect::<Vec<_>>())?;
         let mut frame = vec![0; layout.size_bytes()];
         let mut planes = layout.planes_mut(&mut frame, 0).into_iter();
         let ground = std::array::from_fn(|component| {
@@ -64,13 +68,15 @@ impl Pattern {
             sequence: low,
             time_ns: info.capture_ns,
         });
-        for (component, (mut plane, ground)) in self
-            .layout
-            .planes_mut(frame, 0)
-            .into_iter()
-            .zip(&self.ground)
-            .enumerate()
-        {
+        for field in 0..self.layout.fields().len() {
+            self.draw_field(self.layout.planes_mut(frame, field), &cells, info);
+        }
+        Ok(())
+    }
+
+    fn draw_field(&self, planes: Vec<PlaneMut<'_>>, cells: &[bool; GRID_CELLS], info: &FrameInfo) {
+        let planes = planes.into_iter().zip(&self.ground);
+        for (component, (mut plane, ground)) in planes.enumerate() {
             let upper = upper_rows(plane.rows);
             let luma = component == 0;
             for row in 0..upper {
@@ -100,7 +106,6 @@ impl Pattern {
             }
             bar(&mut plane, upper, component, info.capture_ns);
         }
-        Ok(())
     }
 }
 
@@ -266,10 +271,22 @@ mod tests {
     }
 
     fn drawn(width: u32, height: u32, info: &FrameInfo) -> Vec<u8> {
-        let pattern = Pattern::new(width, height).unwrap();
+        let pattern = Pattern::new(width, height, &["picture"]).unwrap();
         let mut bytes = vec![0; pattern.layout().size_bytes()];
         pattern.draw(&mut bytes, info).unwrap();
         bytes
+    }
+
+    #[test]
+    fn each_field_carries_the_stamp() {
+        let pattern = Pattern::new(65, 67, &["left", "right"]).unwrap();
+        let mut bytes = vec![0; pattern.layout().size_bytes()];
+        pattern.draw(&mut bytes, &info(5, 6)).unwrap();
+        let frame = Frame::parse(&bytes).unwrap();
+        let stamps: Vec<_> = frame.fields().map(|field| read(&field).unwrap()).collect();
+        assert_eq!(stamps.len(), 2);
+        assert!(stamps.iter().all(|s| (s.sequence, s.time_ns) == (5, 6)));
+        assert!(Pattern::new(64, 64, &["left", "left"]).is_err());
     }
 
     #[test]
@@ -320,6 +337,6 @@ mod tests {
         let b = drawn(320, 240, &info(1, 1_000_000_000));
         let lower = |bytes: &[u8]| bytes[192 + 320 * 150..192 + 320 * 151].to_vec();
         assert_ne!(lower(&a), lower(&b));
-        assert!(Pattern::new(63, 64).is_err());
+        assert!(Pattern::new(63, 64, &["picture"]).is_err());
     }
 }

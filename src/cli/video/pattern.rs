@@ -23,6 +23,14 @@ pub(crate) struct Args {
     /// Width and height, or a name such as cif
     #[arg(long, value_name = "SIZE", default_value = "640x480", value_parser = size)]
     size: (u32, u32),
+    /// Names of the pictures of one instant that each frame holds
+    #[arg(
+        long,
+        value_name = "NAMES",
+        value_delimiter = ',',
+        default_value = "picture"
+    )]
+    fields: Vec<String>,
     /// Frames a second
     #[arg(long, value_name = "RATE", default_value = "30 Hz", value_parser = units::rate)]
     rate: f64,
@@ -34,8 +42,9 @@ pub(crate) struct Args {
 /// Runs the verb. Without `--frames` it ends when it is interrupted.
 pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
     let (width, height) = args.size;
-    let pattern = Pattern::new(width, height)
-        .hint(|| "at least 64x64".to_owned())
+    let fields: Vec<&str> = args.fields.iter().map(String::as_str).collect();
+    let pattern = Pattern::new(width, height, &fields)
+        .hint(|| "at least 64x64, and 1 to 8 fields".to_owned())
         .arguments()?;
     let interrupt = Interrupt::listen(context.tethered)?;
     let store = context.store("video pattern")?;
