@@ -254,7 +254,7 @@ fn ms(time: Duration) -> f64 {
 
 const PROMISED: Duration = Duration::from_millis(1);
 /// What piles up while the sender tries whether more goes, and while a thread that is the link is kept waiting.
-const TRIES: Duration = Duration::from_millis(2);
+const TRIES: Duration = Duration::from_millis(4);
 /// Where bulk goes.
 const LINKS: [&str; 2] = ["beside bulk", "bulk on another link"];
 const BULK_BYTES: usize = 6 << 20;

@@ -29,7 +29,9 @@ pub(super) struct Congestion {
     queue: Duration,
     /// How much that differs from report to report, of few datagrams and of many, whose fastest is rarely held up.
     jitter: [Duration; 2],
-    /// Whether the newest report is one of many.
+    /// Whether commands go by this path: a short queue is worth some of what it carries then.
+    watchful: bool,
+    /// Whether the newest report is one of many, and its fastest datagram tells what has piled up.
     dense: bool,
     /// The newest reports, enough to tell a rate, and whether what they say is lost was lost on a path that was not full.
     arrived: VecDeque<(Progress, bool)>,
@@ -77,6 +79,7 @@ impl Congestion {
             loss_mean: 0.0,
             queue: Duration::ZERO,
             jitter: [JITTER_FIRST; 2],
+            watchful: false,
             dense: false,
             arrived: VecDeque::new(),
             ceiling: None,
@@ -146,6 +149,11 @@ impl Congestion {
         permille(self.loss_mean)
     }
 
+    /// Says whether commands go by this path.
+    pub(super) fn set_watchful(&mut self, watchful: bool) {
+        self.watchful = watchful;
+    }
+
     /// Takes in a report. `used` tells how the path was used since the one before, and `round_trip` how
     /// long it takes now until what is sent is reported, with what has piled up; `sent` is the number of the newest datagram.
     pub(super) fn handle_report(
@@ -171,8 +179,10 @@ impl Congestion {
             share,
         } = way;
         self.share = share.clamp(SHARE_MIN, SHARE_MAX);
-        // On a link with much jitter the fastest of many differs slowly, and by more than it seems.
-        self.dense = progress.received >= DENSE_DATAGRAMS
+        // On a link with much jitter the fastest of many differs slowly, and by more than it seems; where cores and not the
+        // link are the limit, threads that are kept waiting look like a queue, and short batches cost more.
+        self.dense = self.watchful
+            && progress.received >= DENSE_DATAGRAMS
             && progress.span < DENSE_SPAN
             && self.jitter[0] < DENSE_JITTER;
         let queue_before = std::mem::replace(&mut self.queue, queue);

@@ -79,6 +79,8 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             let used = self.pace.take_used(now);
             let sent = self.datagrams;
             self.congestion
+                .set_watchful(self.flows.values().any(Flow::is_command));
+            self.congestion
                 .handle_report(&progress, way, used, round_trip, sent, now);
         }
     }
