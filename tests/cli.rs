@@ -550,7 +550,7 @@ fn the_present_frame_is_a_picture_and_the_stream_is_known() {
 fn streams_do_not_notice_who_stalls_or_dies_beside_them() {
     let daemon = Daemon::start(&[]);
     let pattern = |name: &str, fields: &str| {
-        let size = ["--size", "64x64", "--rate", "100"];
+        let size = ["--size", "64x64", "--rate", "25"];
         let verb = ["video", "pattern", "--name", name, "--fields", fields];
         daemon.background(&[&verb[..], &size].concat())
     };
@@ -578,7 +578,7 @@ fn streams_do_not_notice_who_stalls_or_dies_beside_them() {
         .chain(&["stereo", "other"])
         .map(|name| {
             let path = daemon.dir.0.join(format!("{name}.y4m"));
-            let output = ["--output", path.to_str().unwrap(), "--frames", "50"];
+            let output = ["--output", path.to_str().unwrap(), "--frames", "25"];
             daemon.background(&[&["video", "save", name], &output[..]].concat())
         })
         .collect();
