@@ -98,12 +98,13 @@ fn unknown(text: &str, unit: &str, known: &str) -> String {
     format!("`{text}` has the unknown unit `{unit}`: known are {known}")
 }
 
+/// The whole number nearest to one that is not negative.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
     reason = "a float-to-integer `as` saturates, and the number is not negative"
 )]
-fn whole(number: f64) -> u64 {
+pub(crate) fn whole(number: f64) -> u64 {
     number.round() as u64
 }
 

@@ -52,7 +52,7 @@ pub(crate) struct StreamReader {
 /// What the samples of a frame item are.
 pub(crate) fn schema() -> Result<Schema, Error> {
     Ok(Schema::raw(
-        "frame",
+        SCHEMA,
         "ddx",
         "frame, version 1: video/src/frame.rs",
     )?)
@@ -194,7 +194,8 @@ impl StreamReader {
 
 /// Whether the samples of an item are frames.
 pub(crate) fn is_stream(other: &Schema) -> bool {
-    schema().is_ok_and(|schema| schema == *other)
+    // Made only for those that may be it: this is asked of each sample of each item that is watched.
+    other.name() == SCHEMA && schema().is_ok_and(|schema| schema == *other)
 }
 
 /// What a frame says of itself, in place of its planes.
@@ -225,6 +226,8 @@ fn frame_name(store: &Store, name: &str) -> Result<ItemName, Failure> {
     Ok(name)
 }
 
+/// The name of the schema of frames.
+const SCHEMA: &str = "frame";
 /// Frames that the ring of a stream holds: a third of a second at 25 a second.
 const DEPTH: u32 = 8;
 /// Frames that readers may hold beyond the two that each has, together.

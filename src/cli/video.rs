@@ -8,12 +8,14 @@ mod snap;
 mod v4l2;
 mod view;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ddx_video::frame::{Field, Frame};
+use ddx_wire::ItemName;
 
 use super::Context;
 use super::interrupt::SLICE;
+use super::output::note;
 use crate::error::{Failure, Outcome};
 use crate::video::play::Lateness;
 
@@ -48,6 +50,34 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         Verb::View(args) => view::run(context, args),
     }
 }
+
+/// Tells once, after a while, that no frame has come yet.
+#[derive(Debug)]
+struct Quiet {
+    tells_at: Option<Instant>,
+}
+
+impl Default for Quiet {
+    fn default() -> Self {
+        Self {
+            tells_at: Some(Instant::now() + QUIET),
+        }
+    }
+}
+
+impl Quiet {
+    fn look(&mut self, name: &ItemName) {
+        if self.tells_at.is_some_and(|at| Instant::now() >= at) {
+            self.tells_at = None;
+            note(&format!(
+                "no frame of `{name}` yet\nhint: `ddx why {name}` says why"
+            ));
+        }
+    }
+}
+
+/// After so long without a first frame the user is told.
+const QUIET: Duration = Duration::from_secs(2);
 
 /// The field of that name, or the first.
 fn field<'a>(frame: &Frame<'a>, name: Option<&str>) -> Result<Field<'a>, Failure> {

@@ -62,8 +62,9 @@ pub(crate) trait Camera {
 pub(crate) trait Sink {
     /// Whether somebody, on any host, reads.
     fn is_read(&self) -> bool;
-    /// Publishes the frame of that number; `dropped` came damaged until now.
-    fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<(), Failure>;
+    /// Publishes the frame of that number unless there is not enough of it, and tells whether; `dropped` came damaged until
+    /// now.
+    fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<bool, Failure>;
     /// Tells the settings that hold from a frame on.
     fn tell(&mut self, controls: &[Control], from: u64) -> Result<(), Failure>;
 }
@@ -162,27 +163,22 @@ impl<P: Port> Capture<P> {
         let (captured, divider) = (self.captured, self.divider);
         let (published, dropped) = (self.published, self.dropped);
         let line = self.mode.bytes_per_line;
-        let mut done = Ok(false);
-        let mut is_whole = true;
+        let mut done = None;
         let came = camera.next(timeout, |bytes| {
-            if captured % divider != 0 {
-                return;
+            if captured % divider == 0 {
+                let fill =
+                    |layout: &Layout, frame: &mut [u8]| gather(layout, frame, bytes, line).is_ok();
+                done = Some(sink.publish(published + 1, dropped, &fill));
             }
-            let whole = std::cell::Cell::new(true);
-            let fill = |layout: &Layout, frame: &mut [u8]| {
-                whole.set(gather(layout, frame, bytes, line).is_ok());
-                whole.get()
-            };
-            done = sink
-                .publish(published + 1, dropped, &fill)
-                .map(|()| whole.get());
-            is_whole = whole.get();
         });
         match came {
             Ok(true) => {
                 self.captured += 1;
-                self.published += u64::from(done?);
-                self.dropped += u64::from(!is_whole);
+                match done.transpose()? {
+                    Some(true) => self.published += 1,
+                    Some(false) => self.dropped += 1,
+                    None => {}
+                }
                 self.watch(sink)?;
                 Ok(Turn::Captured)
             }
@@ -246,8 +242,8 @@ impl Sink for (StreamWriter, &str) {
         self.0.readers() > 0
     }
 
-    fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<(), Failure> {
-        self.0.publish(dropped, |layout, bytes| {
+    fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<bool, Failure> {
+        let published = self.0.publish(dropped, |layout, bytes| {
             // The driver has just handed it over: nothing tells more exactly when it was taken.
             let now = ddx_store::now();
             let info = FrameInfo {
@@ -258,7 +254,7 @@ impl Sink for (StreamWriter, &str) {
             layout.write_header(bytes, &info)?;
             Ok(fill(layout, bytes).then_some((info, now)))
         })?;
-        Ok(())
+        Ok(published.is_some())
     }
 
     fn tell(&mut self, controls: &[Control], from: u64) -> Result<(), Failure> {
@@ -398,14 +394,15 @@ mod tests {
             self.readers > 0
         }
 
-        fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<(), Failure> {
+        fn publish(&mut self, number: u64, dropped: u64, fill: Fill<'_>) -> Result<bool, Failure> {
             let spec = FieldSpec::new("a", PixelFormat::Yuyv, 16, 4);
             let layout = Layout::new(&[spec])?;
             let mut frame = vec![0; layout.size_bytes()];
-            if fill(&layout, &mut frame) && frame.ends_with(&[7; 32]) {
+            let is_whole = fill(&layout, &mut frame) && frame.ends_with(&[7; 32]);
+            if is_whole {
                 self.frames.push((number, dropped));
             }
-            Ok(())
+            Ok(is_whole)
         }
 
         fn tell(&mut self, controls: &[Control], from: u64) -> Result<(), Failure> {

@@ -11,6 +11,8 @@ use linuxvideo::{BufType, CapabilityFlags, Device, Fract};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
+use crate::units;
+
 use super::camera::{Camera, Control, Mode, Port, Wanted};
 
 /// The file of a device.
@@ -178,21 +180,14 @@ fn configured(path: &Path, wanted: &Wanted) -> io::Result<(Mode, linuxvideo::Vid
         bytes_per_line: usize::try_from(got.bytes_per_line()).map_err(io::Error::other)?,
     };
     if let Some(rate) = wanted.rate {
-        let interval = Fract::new(1_000, thousandths(rate));
+        let interval = Fract::new(
+            1_000,
+            u32::try_from(units::whole(rate * 1_000.0)).map_err(io::Error::other)?,
+        );
         // Not every driver has a choice, and then says that it does not know the question.
         let _chosen = device.set_frame_interval(interval);
     }
     Ok((mode, device))
-}
-
-fn thousandths(rate: f64) -> u32 {
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "a float-to-integer `as` saturates, and rates are positive"
-    )]
-    let thousandths = (rate * 1_000.0).round() as u32;
-    thousandths.max(1)
 }
 
 fn controls(device: &Device) -> io::Result<Vec<Control>> {

@@ -13,7 +13,7 @@ use super::super::Context;
 use super::super::interrupt::Interrupt;
 use super::super::output::note;
 use super::super::render::bytes;
-use super::SLICE;
+use super::{Quiet, SLICE};
 use crate::error::{Exit, Failure, Hint as _, Outcome};
 use crate::units;
 use crate::video::recorder::{Recorder, Refused, Sink};
@@ -85,17 +85,13 @@ fn save(
     let mut recorder: Option<Recorder> = None;
     let mut report = Report::default();
     let mut first_ns = None;
-    let mut told = false;
+    let mut quiet = Quiet::default();
     let started = Instant::now();
     let mut taken = 0;
     while args.frames.is_none_or(|most| taken < most) && !interrupt.is_raised() {
         let Some(guard) = stream.frames().next_pinned(SLICE)? else {
-            if taken == 0 && !told && started.elapsed() > QUIET {
-                told = true;
-                note(&format!(
-                    "no frame of `{0}` yet\nhint: `ddx why {0}` says why",
-                    stream.name()
-                ));
+            if taken == 0 {
+                quiet.look(stream.name());
             }
             continue;
         };
@@ -115,7 +111,7 @@ fn save(
             recorder = Some(Recorder::start(
                 sink,
                 header,
-                whole(room),
+                usize::try_from(units::whole(room))?,
                 guard.bytes().len(),
             )?);
         }
@@ -162,14 +158,14 @@ fn save(
 
 /// A rate as others know it: of NTSC's thousand and first parts too.
 fn fraction(rate: f64) -> (u32, u32) {
-    let thousandths = whole((rate * 1_001.0).round());
+    let thousandths = units::whole(rate * 1_001.0);
     let is_ntsc =
         (rate - rate.round()).abs() > 1e-6 && (rate * 1_001.0 / 1_000.0).fract().abs() < 1e-3;
-    let word = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
+    let word = |number: u64| u32::try_from(number).unwrap_or(u32::MAX);
     match is_ntsc {
         true => (word(thousandths), 1_001),
         false => {
-            let (mut over, mut under) = (whole((rate * 1_000.0).round()), 1_000);
+            let (mut over, mut under) = (units::whole(rate * 1_000.0), 1_000);
             for factor in [2, 2, 2, 5, 5, 5] {
                 if over % factor == 0 && under % factor == 0 {
                     (over, under) = (over / factor, under / factor);
@@ -180,16 +176,5 @@ fn fraction(rate: f64) -> (u32, u32) {
     }
 }
 
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_sign_loss,
-    reason = "a float-to-integer `as` saturates, and the number is not negative"
-)]
-fn whole(number: f64) -> usize {
-    number as usize
-}
-
-/// After so long without a first frame the user is told.
-const QUIET: Duration = Duration::from_secs(2);
 /// Frames that wait at most.
 const ROOM_MAX: f64 = 10_000.0;

@@ -2,7 +2,6 @@
 
 use std::env;
 use std::io;
-use std::time::{Duration, Instant};
 
 use ddx_store::Delivery;
 use ddx_video::convert::to_rgb;
@@ -11,9 +10,8 @@ use serde_json::json;
 
 use super::super::Context;
 use super::super::interrupt::Interrupt;
-use super::super::output::note;
 use super::super::render::clip;
-use super::{SLICE, field};
+use super::{Quiet, SLICE, field};
 use crate::error::{Exit, Failure, Outcome};
 use crate::units;
 use crate::video::terminal::{Graphics, Room, draw};
@@ -51,9 +49,7 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
     let interrupt = Interrupt::listen(context.tethered)?;
     let store = context.store("video view")?;
     let mut stream = StreamReader::open(&store, &args.name, Delivery::Latest, Some(args.rate))?;
-    let least = Duration::from_secs_f64(1.0 / args.rate);
-    let (started, mut told, mut shown) = (Instant::now(), false, 0);
-    let mut last = None::<Instant>;
+    let (mut quiet, mut shown) = (Quiet::default(), 0);
     context.out.raw(OPEN)?;
     let result = loop {
         if interrupt.is_raised() || args.frames.is_some_and(|most| shown >= most) {
@@ -62,21 +58,13 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         let guard = match stream.frames().next_pinned(SLICE) {
             Ok(Some(guard)) => guard,
             Ok(None) => {
-                if shown == 0 && !told && started.elapsed() > QUIET {
-                    told = true;
-                    let name = stream.name();
-                    note(&format!(
-                        "no frame of `{name}` yet\r\nhint: `ddx why {name}` says why"
-                    ));
+                if shown == 0 {
+                    quiet.look(stream.name());
                 }
                 continue;
             }
             Err(error) => break Err(error.into()),
         };
-        if last.is_some_and(|at| at.elapsed() < least) {
-            continue;
-        }
-        last = Some(Instant::now());
         match show(context, args, graphics, &guard, stream.name().as_str()) {
             Ok(()) => shown += 1,
             Err(failure) => break Err(failure),
@@ -154,5 +142,3 @@ fn graphics(text: &str) -> Result<Graphics, String> {
 const OPEN: &str = "\x1b[?1049h\x1b[?25l\x1b[2J";
 const CLOSE: &str = "\x1b[?25h\x1b[?1049l";
 const USUAL: (u32, u32) = (80, 24);
-/// After so long without a first frame the user is told.
-const QUIET: Duration = Duration::from_secs(2);
