@@ -44,7 +44,7 @@ fn each_kind_of_bad_datagram_is_counted_by_its_reason() {
         } else {
             daemon.data()
         };
-        let mut good_head = vec![3, 0];
+        let mut good_head = vec![4, 0];
         good_head.resize(40, 0);
         let mut other = good_head.clone();
         other[0] = other_version;

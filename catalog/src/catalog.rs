@@ -31,7 +31,7 @@ mod beacon;
 mod handle;
 
 /// A host of which something came so recently is not probed by membership: a little more than the pause between two digests.
-const SIGN_OF_LIFE: Duration = Duration::from_millis(1_100);
+const SIGN_OF_LIFE: Duration = Duration::from_millis(1_700);
 /// Membership datagrams that wait for a session with their destination, of at most 1,100 B each: 275 KiB.
 const WAITING_MAX: usize = 256;
 
@@ -144,7 +144,7 @@ pub struct HostStatus {
     pub rtt: Option<Duration>,
     /// Its boot clock minus this host's.
     pub clock: Option<ClockOffset>,
-    /// When its beacon last came here by multicast. They come each 4 to 4.5 s, unless it sends none.
+    /// When its beacon last came here by multicast. They come each 8 to 8.5 s, unless it sends none.
     pub beacon_heard: Option<Time>,
     /// When it last said that this host's beacon came there by multicast. In a domain of more than a few it says so of a
     /// share of them.
@@ -243,9 +243,10 @@ impl Catalog {
                 TimerName::Hosts => self.watch(now),
                 TimerName::Directory => {
                     let up = self.up();
-                    let me = self.sessions.tag();
+                    let (sessions, hosts) = (&self.sessions, &self.hosts);
+                    let age = |tag| beacon::age_s(hosts.get(sessions.get(tag)?.host)?, now);
                     self.directory
-                        .handle_timeout(now, me, &up, &mut self.rng, &mut self.out);
+                        .handle_timeout(now, &up, age, &mut self.rng, &mut self.out);
                 }
                 TimerName::Interest => {
                     for owner in self.interest.handle_timeout(now, &mut self.out) {
@@ -595,7 +596,7 @@ impl Catalog {
         }
         let version = self.directory.version();
         self.out.send(tag, &Message::Ping { version });
-        let summary = self.directory.summary(self.sessions.tag(), &mut self.rng);
+        let summary = self.directory.summary(tag, &mut self.rng);
         self.out.send(tag, &summary);
         let waiting = std::mem::take(&mut self.waiting);
         for (to, bytes) in waiting {

@@ -21,11 +21,12 @@ use crate::event::Event;
 use crate::outbox::Outbox;
 use crate::rng::Rng;
 
-const DIGEST_PERIOD: Duration = Duration::from_secs(1);
+/// With a beacon now and then it is all that an idle host says.
+const DIGEST_PERIOD: Duration = Duration::from_millis(1_600);
 /// Entries of the periodic digest: few, so that idle traffic does not grow with the domain.
 const DIGEST_SLICE: usize = 8;
 /// Entries that are read of a digest: an entry takes at most 18 bytes, so these fit one datagram.
-const DIGEST_ENTRIES: usize = 60;
+const DIGEST_ENTRIES: usize = 58;
 /// Changes made within this time travel together.
 const PUSH_AFTER: Duration = Duration::from_millis(2);
 /// Hosts to which a change is pushed; beyond, digests spread the news.
@@ -57,6 +58,8 @@ pub(crate) struct Directory {
     push: Option<(u64, Time)>,
     reminders: Vec<Time>,
     next_digest: Option<Time>,
+    /// Who got the last digest: hosts take turns.
+    digested: Option<Tag>,
     remote_bytes: usize,
     dropped: u64,
 }
@@ -112,6 +115,7 @@ impl Directory {
             push: None,
             reminders: Vec::new(),
             next_digest: None,
+            digested: None,
             remote_bytes: 0,
             dropped: 0,
         }
@@ -317,7 +321,7 @@ impl Directory {
             }
         }
         if !newer.is_empty() {
-            out.send(from, &Message::Digest(newer));
+            out.send(from, &self.news(None, newer));
         }
         strangers
     }
@@ -445,21 +449,17 @@ impl Directory {
     pub(crate) fn handle_timeout(
         &mut self,
         now: Time,
-        me: Tag,
         up: &[Tag],
+        beacon_age_s: impl Fn(Tag) -> Option<u8>,
         rng: &mut Rng,
         out: &mut Outbox,
     ) {
-        let news = DigestEntry {
-            tag: me,
-            version: self.own.version(),
-        };
         if let Some((first, _)) = self.push.filter(|(_, at)| *at <= now) {
             self.push = None;
             if up.len() <= PUSH_MAX {
                 let range = Range {
                     from: first - 1,
-                    to: news.version,
+                    to: self.own.version(),
                 };
                 for tag in up {
                     self.own.order(*tag, vec![range], false, now);
@@ -471,14 +471,18 @@ impl Directory {
             self.reminders.remove(0);
             let start = rng.below(up.len());
             for tag in up.iter().cycle().skip(start).take(up.len().min(DIGEST_FAN)) {
-                out.send(*tag, &Message::Digest(vec![news]));
+                out.send(*tag, &self.news(beacon_age_s(*tag), Vec::new()));
             }
         }
         if self.next_digest.is_some_and(|at| at <= now) {
             self.next_digest = Some(now + DIGEST_PERIOD);
-            if let Some(to) = rng.pick(up) {
-                let entries = self.digest(news, DIGEST_SLICE, rng);
-                out.send(to, &Message::Digest(entries));
+            // The first is drawn, or all hosts would begin with the same one.
+            let last = self.digested.or_else(|| rng.pick(up));
+            let next = up.iter().filter(|tag| Some(**tag) > last).min();
+            self.digested = next.or_else(|| up.iter().min()).copied();
+            if let Some(to) = self.digested {
+                let others = self.slice(to, DIGEST_SLICE, rng);
+                out.send(to, &self.news(beacon_age_s(to), others));
             }
         }
         for remote in self.remotes.values_mut() {
@@ -492,22 +496,27 @@ impl Directory {
 
     /// What is known of all hosts, as far as one datagram holds it: for a host that comes back, which may have missed
     /// anything, and may know what this one has missed of hosts that were cut off with it.
-    pub(crate) fn summary(&self, me: Tag, rng: &mut Rng) -> Message {
-        let news = DigestEntry {
-            tag: me,
-            version: self.own.version(),
-        };
-        Message::Digest(self.digest(news, DIGEST_ENTRIES, rng))
+    pub(crate) fn summary(&self, to: Tag, rng: &mut Rng) -> Message {
+        self.news(None, self.slice(to, DIGEST_ENTRIES, rng))
     }
 
-    fn digest(&self, news: DigestEntry, most: usize, rng: &mut Rng) -> Vec<DigestEntry> {
+    fn news(&self, beacon_age_s: Option<u8>, others: Vec<DigestEntry>) -> Message {
+        Message::Digest {
+            version: self.own.version(),
+            beacon_age_s,
+            others,
+        }
+    }
+
+    /// What is known of some hosts, for one of them that knows itself best.
+    fn slice(&self, to: Tag, most: usize, rng: &mut Rng) -> Vec<DigestEntry> {
         let start = rng.below(self.remotes.len());
         let known = self.remotes.values().map(|r| DigestEntry {
             tag: r.tag,
             version: r.have,
         });
         let known = known.clone().skip(start).chain(known.take(start));
-        std::iter::once(news).chain(known).take(most).collect()
+        known.filter(|entry| entry.tag != to).take(most).collect()
     }
 
     fn schedule_push(&mut self, now: Time) {

@@ -1,7 +1,7 @@
 //! The hosts of the domain as this one sees them: up, unreachable, down, or gone.
 //!
 //! Any authentic datagram is a sign of life. Silence alone proves nothing in a large domain, where most pairs have nothing to
-//! say; so silence of a host that should speak, or a rumour about it, raises a doubt, a doubted host is asked each 250 ms, and
+//! say; so silence of a host that should speak, or a rumour about it, raises a doubt, a doubted host is asked each 125 ms, and
 //! only unanswered questions make it unreachable and then down.
 
 use std::collections::BTreeMap;
@@ -17,11 +17,16 @@ use crate::membership::{Entry, Rumour};
 use crate::outbox::Outbox;
 
 /// Pause between two looks at all hosts, and between two questions to a doubted one.
-const WATCH_PERIOD: Duration = Duration::from_millis(250);
-/// Silence of a host that should speak, after which it is doubted.
-const DOUBT_AFTER: Duration = Duration::from_millis(1_500);
-/// A doubt lasts at least so long before it has consequences: five questions.
+const WATCH_PERIOD: Duration = Duration::from_millis(125);
+/// Silence of a host, after which it is doubted: one that speaks each second at least, since one of the two reads from the other,
+/// and any other of a small domain, which sends a digest each 1.6 s.
+const DOUBT_BUSY_AFTER: Duration = Duration::from_millis(1_500);
+const DOUBT_AFTER: Duration = Duration::from_millis(1_700);
+/// A doubt lasts at least so long before it has consequences: ten questions, all of which a living one at 33 % loss would lose once in
+/// 300 doubts.
 const DOUBT_LEAST: Duration = Duration::from_millis(1_250);
+/// Pause between two questions to hosts that do not answer.
+const ABSENT_PERIOD: Duration = Duration::from_millis(250);
 const UNREACHABLE_AFTER: Duration = Duration::from_secs(3);
 const DOWN_AFTER: Duration = Duration::from_secs(10);
 /// A host that is down was asked for at least so long: 28 questions, all of which a living one at 33 % loss would lose once in 10^7.
@@ -95,6 +100,7 @@ pub(crate) struct Hosts {
     pub(crate) dropped: u64,
     /// The last absent host that was asked: they take turns.
     turn: Option<HostId>,
+    next_question: Time,
 }
 
 impl Hosts {
@@ -208,7 +214,8 @@ impl Hosts {
                 tasks.push(Task::Revive(host.entry.clone()));
             }
             let rumoured = host.rumoured_down || suspects.contains(id);
-            let doubtful = silence >= DOUBT_AFTER && (few || busy(host.tag));
+            let doubtful =
+                (silence >= DOUBT_AFTER && few) || (silence >= DOUBT_BUSY_AFTER && busy(host.tag));
             if host.doubted.is_none() && (rumoured || doubtful) {
                 host.doubted = Some(now);
             }
@@ -227,7 +234,10 @@ impl Hosts {
                 host.turn(HostState::Down, now, out);
             }
         }
-        if let Some(absent) = self.next_absent() {
+        if self.next_question <= now
+            && let Some(absent) = self.next_absent()
+        {
+            self.next_question = now + ABSENT_PERIOD;
             self.turn = Some(absent);
             tasks.push(Task::Ask(absent));
         }
@@ -356,7 +366,7 @@ mod tests {
         hosts.get(HostId([1; 16])).unwrap().state
     }
 
-    /// Looks at all hosts each 250 ms for `span`; the questions asked.
+    /// Looks at all hosts, as often as is due, for `span`; the questions asked.
     fn watch(hosts: &mut Hosts, from: Time, span: Duration, busy: bool) -> usize {
         let mut asked = 0;
         let mut at = from;

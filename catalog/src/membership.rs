@@ -213,7 +213,7 @@ fn configuration() -> foca::Config {
         max_packet_size: NonZeroUsize::MIN.saturating_add(PACKET_MAX_BYTES - 1),
         notify_down_members: true,
         periodic_announce: Some(foca::PeriodicParams {
-            frequency: Duration::from_secs(30),
+            frequency: Duration::from_mins(2),
             num_members: NonZeroUsize::MIN,
         }),
         // Hosts that are down are greeted each 250 ms outside of this protocol.

@@ -31,7 +31,9 @@ const BEACON_START: [Duration; 7] = [
     Duration::from_secs(1),
     Duration::from_secs(1),
 ];
-const BEACON_PERIOD: Duration = Duration::from_secs(4);
+/// Who is alone looks out for others more often: those that have company answer it.
+const BEACON_PERIOD_ALONE: Duration = Duration::from_secs(2);
+const BEACON_PERIOD: Duration = Duration::from_secs(8);
 const SEED_PERIOD: Duration = Duration::from_millis(500);
 /// News of this host's addresses are said again after these pauses, in case they were lost.
 const NEWS_AGAIN: [Duration; 3] = [
@@ -372,10 +374,12 @@ impl Sessions {
         if self.next_beacon.is_some_and(|at| at <= now) {
             self.hello(Dest::Beacon, false, now, out);
             let jitter = Duration::from_millis(u64::try_from(rng.below(500)).unwrap_or(0));
-            let pause = BEACON_START
-                .get(self.beacons)
-                .copied()
-                .unwrap_or(BEACON_PERIOD + jitter);
+            let period = match self.live.is_empty() {
+                true => BEACON_PERIOD_ALONE,
+                false => BEACON_PERIOD,
+            };
+            let pause = BEACON_START.get(self.beacons).copied();
+            let pause = pause.unwrap_or(period + jitter);
             self.beacons = self.beacons.saturating_add(1);
             self.next_beacon = Some(now + pause);
         }

@@ -74,5 +74,5 @@ fn doctor(site: &Site, host: &str, arguments: &[&str]) -> (Option<i32>, Vec<Valu
 }
 
 const KEY: &[&str] = &["--key", "/run/key"];
-/// Two beacons, and the second in which the daemon shows them.
-const BEACONS: std::time::Duration = std::time::Duration::from_secs(11);
+/// Two beacons, the digest that tells of them, and the second in which the daemon shows them.
+const BEACONS: std::time::Duration = std::time::Duration::from_secs(20);

@@ -163,9 +163,15 @@ impl Catalog {
                 );
             }
             Message::Pong { version } => self.directory.note_version(host, tag, version, now, out),
-            Message::Digest(entries) => {
+            Message::Digest {
+                version,
+                beacon_age_s,
+                others,
+            } => {
+                self.directory.note_version(host, tag, version, now, out);
                 let me = self.sessions.tag();
-                let strangers = self.directory.handle_digest(tag, me, &entries, now, out);
+                let strangers = self.directory.handle_digest(tag, me, &others, now, out);
+                self.note_answer(host, beacon_age_s, now);
                 self.meet(&strangers, now);
             }
             Message::Pull(ranges) => self.directory.handle_pull(tag, ranges, now),
@@ -239,11 +245,6 @@ impl Catalog {
                 }
                 let news = (revision, control_addrs.as_slice());
                 self.sessions.paths.announced(tag, from, news, now, out);
-            }
-            Message::BeaconHeard => {
-                if let Some(host) = self.hosts.get_mut(host) {
-                    host.beacon_answered = Some(now);
-                }
             }
             Message::Leave => {
                 self.hosts.left(host, now, &mut self.out);

@@ -18,7 +18,7 @@ pub const OVERHEAD_BYTES: usize = 40;
 pub const MAX_DATAGRAM_BYTES: usize = 1_200;
 
 /// Version of the protocol, the first byte of each datagram. Others are dropped and counted.
-pub const PROTOCOL_VERSION: u8 = 3;
+pub const PROTOCOL_VERSION: u8 = 4;
 
 /// The stream id of a datagram that carries several streams, or none.
 pub const MIXED_STREAMS: StreamId = StreamId(0);
@@ -266,7 +266,7 @@ mod tests {
     #[test]
     fn layout_is_golden() {
         let golden = [
-            3, 3, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, 0x0c, 0x0d,
+            4, 3, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, 0x0c, 0x0d,
             0x0e, 0x0f, 0x10, 0x11, 0x12, 0x13, 0x14, 0x15, 0x16,
         ];
         assert_eq!(header().to_bytes(), golden);

@@ -114,8 +114,15 @@ pub enum Message {
         /// Newest change in the speaker's directory.
         version: u64,
     },
-    /// How far the speaker knows the directories of some hosts.
-    Digest(Vec<DigestEntry>),
+    /// How far the speaker's directory has got, and how far it knows those of some other hosts.
+    Digest {
+        /// Newest change in the speaker's directory.
+        version: u64,
+        /// How long ago a beacon of the receiver came to the speaker by multicast, seconds; `None` if the speaker does not say.
+        beacon_age_s: Option<u8>,
+        /// Other hosts.
+        others: Vec<DigestEntry>,
+    },
     /// Send me these changes of your directory.
     Pull(Vec<Range>),
     /// Changes of the speaker's directory.
@@ -176,8 +183,6 @@ pub enum Message {
     Report(Vec<ReportEntry>),
     /// I lack these.
     Nack(Vec<NackEntry>),
-    /// Your beacon came here by multicast.
-    BeaconHeard,
 }
 
 /// How far one life of a host is known.
@@ -406,7 +411,12 @@ mod tests {
             tag: Tag(u64::MAX),
             version: u64::MAX,
         };
-        assert!(length(&Message::Digest(vec![entry; 60])) <= BODY_MAX_BYTES);
+        let digest = Message::Digest {
+            version: u64::MAX,
+            beacon_age_s: Some(u8::MAX),
+            others: vec![entry; 58],
+        };
+        assert!(length(&digest) <= BODY_MAX_BYTES);
         let range = Range {
             from: u64::MAX,
             to: u64::MAX,
@@ -461,8 +471,13 @@ mod tests {
         codec::encode(&addresses, &mut bytes).unwrap();
         assert_eq!(bytes, [17, 3, 1, 0, 10, 0, 0, 1, 7]);
         bytes.clear();
-        codec::encode(&Message::BeaconHeard, &mut bytes).unwrap();
-        assert_eq!(bytes, [20]);
+        let digest = Message::Digest {
+            version: 5,
+            beacon_age_s: Some(7),
+            others: Vec::new(),
+        };
+        codec::encode(&digest, &mut bytes).unwrap();
+        assert_eq!(bytes, [3, 5, 1, 7, 0]);
         let renewed = Message::Renewed {
             echo: Time(1),
             at: Time(2),

@@ -5,7 +5,7 @@
 use crate::{Epoch, Seq, StreamId, Time};
 
 /// Length of the preamble at the head of each plaintext, bytes.
-pub const PREAMBLE_BYTES: usize = 12;
+pub const PREAMBLE_BYTES: usize = 11;
 
 /// What a record of a whole sample usually takes beside its payload, bytes; one that follows its like takes a quarter.
 pub const RECORD_BYTES: usize = 24;
@@ -126,10 +126,9 @@ impl Preamble {
         let limited = if self.is_limited { LIMITED } else { 0 };
         let flags = probe | limited;
         let [p0, p1] = self.path.to_le_bytes();
-        let [f0, f1] = flags.to_le_bytes();
         let [n0, n1, n2, n3] = self.number.to_le_bytes();
         let [s0, s1, s2, s3] = self.sent_us.to_le_bytes();
-        [p0, p1, f0, f1, n0, n1, n2, n3, s0, s1, s2, s3]
+        [p0, p1, flags, n0, n1, n2, n3, s0, s1, s2, s3]
     }
 }
 
@@ -204,7 +203,8 @@ impl<'a> Record<'a> {
             if !alone {
                 head.varint(self.stream.0.into());
             }
-            head.varint(meta.epoch.0);
+            head.varint(meta.epoch.0 >> 32);
+            head.varint(meta.epoch.0 & u64::from(u32::MAX));
             head.varint(meta.seq.0);
             head.varint(meta.publish.0);
         }
@@ -264,10 +264,9 @@ impl<'a> Records<'a> {
     /// Reads the head of an opened datagram, and starts at its first record. `stream` is the one that its header names, if
     /// it names one. `None` if the head is not one.
     pub fn open(plaintext: &'a [u8], stream: Option<StreamId>) -> Option<(Preamble, Self)> {
-        let (&[p0, p1, f0, f1], rest) = plaintext.split_first_chunk()?;
+        let (&[p0, p1, flags], rest) = plaintext.split_first_chunk()?;
         let (number, rest) = rest.split_first_chunk()?;
         let (sent_us, rest) = rest.split_first_chunk()?;
-        let flags = u16::from_le_bytes([f0, f1]);
         if flags & !(PROBE | LIMITED) != 0 {
             return None;
         }
@@ -329,7 +328,10 @@ impl<'a> Records<'a> {
                     (StreamId(u32::try_from(stream).ok()?), rest)
                 }
             };
-            let (epoch, rest) = varint(rest)?;
+            let (ordinal, rest) = varint(rest)?;
+            let (count, rest) = varint(rest)?;
+            let epoch = u64::from(u32::try_from(ordinal).ok()?) << 32;
+            let epoch = epoch | u64::from(u32::try_from(count).ok()?);
             let (seq, rest) = varint(rest)?;
             let (publish, rest) = varint(rest)?;
             let meta = SampleMeta {
@@ -465,12 +467,12 @@ const FILTERED: u8 = 64;
 const FLAGS: u8 = 127;
 /// In a byte of a number: more follow.
 const MORE: u8 = 128;
-/// Flags, the length, the number of the stream, five numbers of 64 bits, and what a fragment says of itself.
-const HEAD_MAX: usize = 1 + 3 + 5 + 5 * 10 + 9;
+/// Flags, the length, the number of the stream, two of 32 bits, four of 64 bits, and what a fragment says of itself.
+const HEAD_MAX: usize = 1 + 3 + 5 + 2 * 5 + 4 * 10 + 9;
 /// Flag of the preamble: padding follows.
-const PROBE: u16 = 1;
+const PROBE: u8 = 1;
 /// Flag of the preamble: the rate holds the sender back.
-const LIMITED: u16 = 2;
+const LIMITED: u8 = 2;
 
 #[cfg(test)]
 mod tests {
@@ -484,7 +486,7 @@ mod tests {
             repeat: true,
             gone: false,
             meta: SampleMeta {
-                epoch: Epoch(0x10),
+                epoch: Epoch(0x11_0000_0010),
                 seq: Seq(0x20),
                 filtered: 0x30,
                 capture: Time(0x40),
@@ -539,6 +541,7 @@ mod tests {
             0x84,
             0x8c,
             0x20,
+            0x11,
             0x10,
             0x20,
             0x50,
@@ -579,7 +582,10 @@ mod tests {
             ..record(b"ab")
         };
         alone.encode(Place::Alone, &mut bytes).unwrap();
-        assert_eq!(bytes[PREAMBLE_BYTES..], [16, 0x10, 0x20, 0x50, b'a', b'b']);
+        assert_eq!(
+            bytes[PREAMBLE_BYTES..],
+            [16, 0x11, 0x10, 0x20, 0x50, b'a', b'b']
+        );
         let (_, records) = Records::open(&bytes, Some(alone.stream)).unwrap();
         assert_eq!(records.collect::<Vec<_>>(), [Ok(alone)]);
         let (_, mut records) = Records::open(&bytes, None).unwrap();
@@ -592,10 +598,29 @@ mod tests {
     }
 
     #[test]
+    fn one_of_1400_bytes_fits_an_ethernet_frame_however_old_its_stream_is() {
+        let payload = [0; 1_400];
+        let old = Record {
+            stream: StreamId(u32::MAX),
+            meta: SampleMeta {
+                epoch: Epoch(100 << 32 | 100),
+                seq: Seq((1 << 35) - 1),
+                filtered: (1 << 35) - 1,
+                // After two years.
+                capture: Time((1 << 56) - 1),
+                publish: Time((1 << 56) - 1),
+            },
+            ..record(&payload)
+        };
+        let datagram = crate::seal::OVERHEAD_BYTES + PREAMBLE_BYTES + old.encoded_len(Place::Alone);
+        assert!(datagram <= 1_472, "{datagram}");
+    }
+
+    #[test]
     fn fragment_is_golden() {
         let bytes = encoded(fragment(0x102, 0x100, b"ab"));
         assert_eq!(bytes[..2], [1 + 2 + 32 + 64, 2]);
-        assert_eq!(bytes[11..], [2, 1, 0, 0, 0, 1, 0, 0, 0, b'a', b'b']);
+        assert_eq!(bytes[12..], [2, 1, 0, 0, 0, 1, 0, 0, 0, b'a', b'b']);
     }
 
     #[test]
@@ -612,7 +637,7 @@ mod tests {
         let good = parity(0x106, 2, b"pq");
         let bytes = encoded(good);
         assert_eq!(bytes[..2], [1 + 2 + 32 + 64, 2]);
-        assert_eq!(bytes[11..], [3, 1, 0, 0, 6, 1, 0, 0, 2, b'p', b'q']);
+        assert_eq!(bytes[12..], [3, 1, 0, 0, 6, 1, 0, 0, 2, b'p', b'q']);
         assert_eq!(Records::new(&bytes).next(), Some(Ok(good)));
         assert_eq!(good.fragment.unwrap().parity(2), Some(1));
         assert_eq!(parity(0x104, 1, b"pq").fragment.unwrap().parity(2), Some(0));
@@ -656,7 +681,7 @@ mod tests {
             assert_eq!(refused, Err(Malformed), "{bad:?}");
         }
         let good = encoded(record(b"ab"));
-        for (at, value) in [(0, 129), (0, 8), (0, 16), (0, 2 + 4), (1, 3), (7, 0)] {
+        for (at, value) in [(0, 129), (0, 8), (0, 16), (0, 2 + 4), (1, 3), (8, 0)] {
             let mut bad = good.clone();
             bad[at] = value;
             assert_eq!(Records::new(&bad).next(), Some(Err(Malformed)), "{at}");
@@ -687,14 +712,14 @@ mod tests {
                 is_limited,
             };
             let mut bytes = preamble.to_bytes().to_vec();
-            assert_eq!(bytes[..4], [2, 1, flags, 0]);
+            assert_eq!(bytes[..4], [2, 1, flags, 6]);
             bytes.extend([9; 3]);
             let (read, records) = Records::open(&bytes, None).unwrap();
             assert_eq!(read, preamble);
             assert_eq!(records.count(), usize::from(!is_probe));
         }
-        assert!(Records::open(&[0, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0], None).is_none());
-        assert!(Records::open(&[0; 11], None).is_none());
+        assert!(Records::open(&[0, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0], None).is_none());
+        assert!(Records::open(&[0; 10], None).is_none());
     }
 
     #[test]

@@ -267,7 +267,7 @@ mod tests {
         let shown: String = datagram.iter().map(|b| format!("{b:02x}")).collect();
         assert_eq!(
             shown,
-            "0303ba684d0000005b9f930c0e7a414f00000000000000009d84ff803e6932ffa541adf71b5d1ca78faa1c"
+            "0403ba684d0000005b9f930c0e7a414f00000000000000009d84ffb088b79e2dc5d4124663cedb8330dcf5"
         );
     }
 

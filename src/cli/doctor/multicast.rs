@@ -19,7 +19,7 @@ use crate::error::{Failure, Outcome};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Wait so long for beacons of hosts that came only now; the rest shows at once
-    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u64).range(0..=3_600))]
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u64).range(0..=3_600))]
     seconds: u64,
 }
 
@@ -87,7 +87,7 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
 /// The ways from each other host to this one, and back.
 pub(super) fn ways(daemon: &Daemon) -> Vec<Way> {
     let hosts = || daemon.hosts.iter().filter(|host| host.state != "left");
-    // In a larger domain only a share of this host's beacons is answered.
+    // In a larger domain each host takes longer to say what it heard.
     let answered = u64::try_from(daemon.clocks.len().div_ceil(ANSWERED)).unwrap_or(u64::MAX);
     hosts()
         .flat_map(|host| {
@@ -229,10 +229,10 @@ impl Way {
     }
 }
 
-/// Three beacons in a row, and half a second for them to be shown: at a loss of one in ten, one in a thousand such spans
-/// has none.
-const PATIENCE_NS: u64 = 14_000_000_000;
-/// Hosts that answer each beacon; of more, so many do.
+/// Three beacons in a row, the digest that tells of the last, and half a second for it to be shown: at a loss of one in ten, one in a
+/// thousand such spans has none.
+const PATIENCE_NS: u64 = 28_000_000_000;
+/// Hosts that get a digest four times in that time; more of them, in a longer one.
 const ANSWERED: usize = 4;
 /// The daemon's state is written once a second.
 const LOOK_PERIOD: Duration = Duration::from_millis(500);

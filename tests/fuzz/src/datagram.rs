@@ -638,11 +638,16 @@ fn message(input: &mut Input<'_>) -> Message {
             version: input.number(),
         },
         3 => {
+            let (version, age) = (input.number(), input.byte());
             let entry = |_| DigestEntry {
                 tag: member(input.byte() % 4).tag(),
                 version: input.number(),
             };
-            Message::Digest((0..count).map(entry).collect())
+            Message::Digest {
+                version,
+                beacon_age_s: (age % 4 > 0).then_some(age),
+                others: (0..count).map(entry).collect(),
+            }
         }
         4 => Message::Pull((0..count).map(|_| range(input)).collect()),
         5 => Message::Delta(Delta {

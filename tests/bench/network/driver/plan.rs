@@ -67,8 +67,9 @@ impl Plan {
             warm: Duration::from_millis(80),
             span: Duration::from_millis(240),
             grace: Duration::from_millis(120),
-            settle: Duration::from_secs(3),
-            idle: Duration::from_secs(4),
+            settle: Duration::from_secs(4),
+            // Some speak each 8 s.
+            idle: Duration::from_secs(10),
             cut: Some(Duration::from_secs(5)),
         }
     }
