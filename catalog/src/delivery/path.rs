@@ -109,6 +109,10 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         }
     }
 
+    fn is_group(&self) -> bool {
+        self.number < FIRST_UNICAST
+    }
+
     pub(super) fn number(&self) -> u16 {
         self.number
     }
@@ -682,15 +686,19 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         offered
     }
 
-    /// Tries, now and then, whether longer datagrams get through to the one host at the other end.
+    /// Tries, now and then, whether longer datagrams get through to those at the other end.
     fn probe(&mut self, now: Time) {
-        if self.number < FIRST_UNICAST || now < self.probe_at {
+        if now < self.probe_at {
             return;
         }
         let pause = PROBE_PAUSES.get(self.probes).copied();
         self.probe_at = now + pause.unwrap_or(PROBE_PAUSE);
         self.probes = self.probes.saturating_add(1);
-        let lengths = [ETHERNET_BYTES, self.datagram_bytes_max];
+        let longest = match self.is_group() {
+            true => ETHERNET_BYTES,
+            false => self.datagram_bytes_max,
+        };
+        let lengths = [ETHERNET_BYTES, longest];
         for len in lengths.map(|len| len.min(self.datagram_bytes_max)) {
             if len <= self.datagram_bytes || span_of(len, self.congestion.rate()) > PROBE_SPAN {
                 continue;

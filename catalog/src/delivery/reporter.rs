@@ -105,6 +105,11 @@ impl Reporter {
         }
     }
 
+    /// Longest datagram that it got, bytes.
+    pub(super) fn longest(&self) -> usize {
+        self.last.longest.into()
+    }
+
     /// How long it takes until a datagram is reported, with what has piled up on the way.
     pub(super) fn round_trip(&self) -> Option<Duration> {
         self.round_trip

@@ -9,7 +9,6 @@ use ddx_wire::{StreamId, Tag, Time};
 use super::super::flow::Flow;
 use super::super::queue::Queue;
 use super::super::reporter::Reporter;
-use super::super::sender::FIRST_UNICAST;
 use super::super::transfer::Flight;
 use super::Path;
 
@@ -60,19 +59,24 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
         own_share: u16,
         now: Time,
     ) {
-        let longest = usize::from(report.longest).min(self.datagram_bytes_max);
-        if self.number >= FIRST_UNICAST {
-            self.datagram_bytes = self.datagram_bytes.max(longest);
-        }
         self.unreported_bytes = 0;
         let departed = self.departed(report.highest);
         let Some(reporter) = self.reporters.get_mut(&from) else {
             self.reporters.insert(from, Reporter::new(*report, now));
+            if self.is_group() {
+                // Perhaps it is behind a link for shorter ones.
+                self.datagram_bytes = self.datagram_bytes.min(self.datagram_bytes_safe);
+                (self.probe_at, self.probes) = (now, 0);
+            }
+            self.lengthen();
             return;
         };
         reporter.seen = reporter.seen.max(departed);
-        if let Some((progress, way)) = reporter.handle_report(report, own_share, now) {
-            let round_trip = reporter.round_trip().unwrap_or(self.round_trip + way.queue);
+        let told = reporter.handle_report(report, own_share, now);
+        let round_trip = reporter.round_trip();
+        self.lengthen();
+        if let Some((progress, way)) = told {
+            let round_trip = round_trip.unwrap_or(self.round_trip + way.queue);
             if self.is_slow_for_one(from, now) {
                 return;
             }
@@ -83,6 +87,13 @@ impl<P: AsRef<[u8]> + Clone> Path<P> {
             self.congestion
                 .handle_report(&progress, way, used, round_trip, sent, now);
         }
+    }
+
+    /// Uses datagrams as long as all who report have got.
+    fn lengthen(&mut self) {
+        let longest = self.reporters.values().map(Reporter::longest).min();
+        let longest = longest.unwrap_or_default().min(self.datagram_bytes_max);
+        self.datagram_bytes = self.datagram_bytes.max(longest);
     }
 
     /// Whether one member of a group is behind a slower link than another: it is to leave the group, which loses too much for

@@ -177,3 +177,35 @@ fn readers_of_a_stream_beyond_the_limit_are_counted() {
     sender.update(STREAM, &route(Via::Unicast, 1_030), Time(0));
     assert_eq!(sender.counters().refused_readers, 6);
 }
+
+#[test]
+fn datagrams_of_a_group_are_as_long_as_each_member_gets() {
+    let mut sender = sender(Via::Group(group()), 3);
+    let mut now = Time(0);
+    let mut number = 0;
+    let mut tell = |sender: &mut Sender<Vec<u8>>, member: u16, longest: u16| {
+        now = now + 100 * MS;
+        number += 100;
+        let report = ReportEntry {
+            path: 4,
+            highest: number,
+            received: number,
+            bytes: number * 1_000,
+            delay_us: 500,
+            at_us: number * 1_000,
+            longest,
+            share: 1_000,
+        };
+        sender.handle_report(reader(member, Via::Unicast).tag, &report, now);
+        let path = sender.paths().find(|path| path.to == group()).unwrap();
+        path.datagram_bytes
+    };
+    assert_eq!(tell(&mut sender, 0, 1_200), 1_200);
+    assert_eq!(tell(&mut sender, 1, 1_200), 1_200);
+    assert_eq!(tell(&mut sender, 0, 1_472), 1_200);
+    assert_eq!(tell(&mut sender, 1, 1_472), 1_472);
+    // Who comes now has got short ones only, and perhaps gets no others.
+    assert_eq!(tell(&mut sender, 2, 600), 1_200);
+    assert_eq!(tell(&mut sender, 1, 1_472), 1_200);
+    assert_eq!(tell(&mut sender, 2, 1_472), 1_472);
+}
