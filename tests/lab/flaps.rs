@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use crate::program::{Order, Program};
 use crate::site::{PATIENCE, Site, row, wait};
 
-/// A hundred times, or as often as `DDX_FLAPS` says.
+/// Fifty times, or as often as `DDX_FLAPS` says.
 #[test]
 fn a_link_that_flaps_leaves_nothing_behind() {
     let flaps: u64 = env::var("DDX_FLAPS").map_or(FLAPS, |flaps| flaps.parse().unwrap());
@@ -47,7 +47,7 @@ fn a_link_that_flaps_leaves_nothing_behind() {
     for (host, (before, after)) in ["robot1", "base"].iter().zip(before.iter().zip(&after)) {
         row(&format!("{host}: {before:?} before, {after:?} after"));
         assert!(
-            after.private_kb < before.private_kb + 1_000,
+            after.private_kb < before.private_kb + KEPT_KB,
             "{host}: {before:?} before, {after:?} after"
         );
         assert_eq!(after.items, before.items, "{host}");
@@ -126,7 +126,9 @@ impl Site {
     }
 }
 
-const FLAPS: u64 = 100;
+const FLAPS: u64 = 50;
+/// What pages may fill up without growing from flap to flap: a thousand take some 250.
+const KEPT_KB: u64 = 500;
 const WARM: u64 = LONG_EACH;
 const ITEMS: usize = 10;
 const SHORT: Duration = Duration::from_millis(30);

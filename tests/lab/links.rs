@@ -1,5 +1,6 @@
 //! Large samples cross emulated links whole and soon.
 
+use std::thread;
 use std::time::Duration;
 
 use ddx_rig::link::{BitsPerSecond, Profile};
@@ -10,22 +11,32 @@ use crate::site::{PATIENCE, SAMPLES, Site, row};
 
 #[test]
 fn samples_of_every_size_cross_a_lan_whole() {
-    cross(None, &[SIZES, &[6 << 20]].concat());
-    cross(Some("lan"), &[SIZES, &[6 << 20]].concat());
+    let sizes = [SIZES, &[6 << 20]].concat();
+    cross(None, &DELIVERIES, &sizes);
+    cross(Some("lan"), &DELIVERIES, &sizes);
 }
 
 #[test]
 fn samples_of_every_size_cross_a_bad_radio_link_whole() {
-    cross(Some("wifi-bad"), SIZES);
+    cross_side_by_side("wifi-bad");
 }
 
 #[test]
 fn samples_of_every_size_cross_a_mobile_network_whole() {
-    cross(Some("lte"), SIZES);
+    cross_side_by_side("lte");
+}
+
+/// A slow link leaves the machine idle: each delivery has one of its own, at the same time.
+fn cross_side_by_side(profile: &str) {
+    thread::scope(|scope| {
+        for delivery in DELIVERIES {
+            scope.spawn(move || cross(Some(profile), &[delivery], SIZES));
+        }
+    });
 }
 
 /// Sends samples of each size, one after another, to a reader behind a link, and judges how long they took.
-fn cross(profile: Option<&str>, sizes: &[usize]) {
+fn cross(profile: Option<&str>, deliveries: &[Delivery], sizes: &[usize]) {
     let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
@@ -34,7 +45,7 @@ fn cross(profile: Option<&str>, sizes: &[usize]) {
         .as_ref()
         .map_or("none".to_owned(), Profile::to_string);
     row("link          delivery       bytes   first    p50    max  bound, ms");
-    for delivery in [Delivery::Latest, Delivery::Every] {
+    for &delivery in deliveries {
         for &bytes in sizes {
             let times = send(&site, delivery, bytes);
             let bound = bound(profile.as_ref(), bytes);
@@ -124,4 +135,5 @@ fn bound(profile: Option<&Profile>, bytes: usize) -> Duration {
 
 /// What the wire carries beside other work, bits per second.
 const MACHINE: f64 = 100e6;
+const DELIVERIES: [Delivery; 2] = [Delivery::Latest, Delivery::Every];
 const SIZES: &[usize] = &[7_900, 8_000, 8_100, 64_000, 1_000_000];

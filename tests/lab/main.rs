@@ -4,7 +4,7 @@
 //! | file | what must hold |
 //! |---|---|
 //! | `beside.rs` | a slow viewer and bulk change nothing for those beside them |
-//! | `flaps.rs` | a link that comes and goes a hundred times leaves nothing behind |
+//! | `flaps.rs` | a link that comes and goes fifty times leaves nothing behind |
 //! | `interest.rs` | nothing is sent until somebody reads, then once, and no longer than somebody reads |
 //! | `hosts.rs` | hosts join, leave, die, are cut off, and come back; a host without a network is whole |
 //! | `books.rs` | each sample is accounted for on each hop, and a reader is told exactly what it missed and why |
