@@ -505,6 +505,21 @@ fn a_video_is_played_as_recorded_at_a_rate_and_step_by_step() {
 }
 
 #[test]
+fn a_video_that_is_looped_keeps_its_rate() {
+    let daemon = Daemon::start(&[]);
+    let path = daemon.dir.0.join("a.y4m");
+    fs::write(&path, video(5)).unwrap();
+    let load = ["video", "load", path.to_str().unwrap(), "--name", "cam"];
+    let _playing = daemon.background(&[&load[..], &["--rate", "50 Hz", "--loop"]].concat());
+
+    let measured = daemon.json(&["hz", "cam", "--count", "1"]);
+
+    // A round of five frames takes as long as five of them, and not four.
+    let rate = measured["rate_hz"].as_f64().unwrap();
+    assert!(rate < 55.0, "{measured}");
+}
+
+#[test]
 fn the_present_frame_is_a_picture_and_the_stream_is_known() {
     let daemon = Daemon::start(&[]);
     let pattern = ["video", "pattern", "--name", "cam", "--size", "64x64"];

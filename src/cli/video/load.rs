@@ -68,6 +68,8 @@ struct Player {
     next: u64,
     published: u64,
     schedule: Option<Schedule>,
+    /// When the frame that was published last has been shown for as long as it should be, in the recording's time.
+    ends: Duration,
 }
 
 /// Runs the verb.
@@ -101,6 +103,7 @@ pub(crate) fn run(context: &mut Context, args: &Args) -> Outcome {
         next: 1,
         published: 0,
         schedule: None,
+        ends: Duration::ZERO,
     };
     let played = if args.step {
         player.step(args, &interrupt)
@@ -143,7 +146,9 @@ fn open(path: &Path, is_pipe: bool) -> Result<Box<dyn Input>, Failure> {
 impl Player {
     fn play(&mut self, args: &Args, interrupt: &Interrupt) -> Result<(), Failure> {
         loop {
-            self.schedule = None;
+            // The last frame of the round before has its time, too.
+            let ended = self.schedule.take();
+            let begins = ended.map(|schedule| schedule.due(self.ends));
             self.skip_to(args.from)?;
             while args.to.is_none_or(|to| self.next <= to) {
                 // Nobody reads any more who has what they wanted: at the end there is nothing to wait for.
@@ -155,7 +160,8 @@ impl Player {
                         return Some(ddx_store::now());
                     }
                     let now = ddx_store::now();
-                    let schedule = schedule.get_or_insert_with(|| Schedule::new(now, at));
+                    let begins = begins.map_or(now, |begins| begins.max(now));
+                    let schedule = schedule.get_or_insert_with(|| Schedule::new(begins, at));
                     let due = schedule.due(at);
                     let goes_on = interrupt.sleep_until(due);
                     let now = ddx_store::now();
@@ -265,6 +271,7 @@ impl Player {
             .time_ns
             .map_or_else(|| by_rate(per_second), Duration::from_nanos);
         let at = rate.map_or(original, by_rate);
+        self.ends = at + Duration::from_secs_f64(1.0 / rate.unwrap_or(per_second));
         let info = FrameInfo {
             sequence: mark.sequence.unwrap_or(number),
             capture_ns: u64::try_from(original.as_nanos()).unwrap_or(u64::MAX),
