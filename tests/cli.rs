@@ -5,16 +5,18 @@
     reason = "a helper of a test fails the test, as the test itself would"
 )]
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use ddx_video::y4m::Reader;
 use serde_json::{Value, json};
 
 const LOG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/data/gps.nmea");
+const CLIP: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/data/bunny.y4m");
 
 /// A directory that goes with the test.
 struct Dir(PathBuf);
@@ -433,6 +435,31 @@ fn a_video_that_is_played_is_recorded_bit_for_bit() {
 }
 
 #[test]
+fn a_film_from_ffmpeg_is_recorded_bit_for_bit() {
+    let daemon = Daemon::start(&[]);
+    let recorded = daemon.dir.0.join("b.y4m");
+    let save = ["video", "save", "film", "--frames", "26", "--output"];
+    let mut saving = daemon.background(&[&save[..], &[recorded.to_str().unwrap()]].concat());
+    daemon.json(&["video", "load", CLIP, "--name", "film", "--lockstep"]);
+
+    assert_eq!(saving.0.wait().unwrap().code(), Some(0));
+    let frames = |path: &Path| {
+        let mut reader = Reader::new(BufReader::new(File::open(path).unwrap())).unwrap();
+        let mut frame = vec![0; reader.layout().size_bytes()];
+        let mut frames = Vec::new();
+        while reader.next_mark().unwrap().is_some() {
+            reader.read_planes(&mut frame).unwrap();
+            frames.push(frame.clone());
+        }
+        (reader.layout().clone(), frames)
+    };
+    let (played, recorded) = (frames(Path::new(CLIP)), frames(&recorded));
+    assert_eq!(played.1.len(), 26);
+    // What is said of the picture, such as the range of its luma, too.
+    assert!(played == recorded, "{:?} {:?}", played.0, recorded.0);
+}
+
+#[test]
 fn a_recording_begins_with_what_is_played_and_not_with_what_was_played() {
     let daemon = Daemon::start(&[]);
     let (played, recorded) = (daemon.dir.0.join("a.y4m"), daemon.dir.0.join("b.y4m"));
@@ -605,7 +632,7 @@ fn streams_do_not_notice_who_stalls_or_dies_beside_them() {
     assert_eq!(viewer.0.try_wait().unwrap(), None);
     drop(viewer);
     let stereo = fs::read(daemon.dir.0.join("stereo.y4m")).unwrap();
-    let mut reader = ddx_video::y4m::Reader::new(stereo.as_slice()).unwrap();
+    let mut reader = Reader::new(stereo.as_slice()).unwrap();
     assert_eq!(reader.layout().fields().len(), 3);
     let mut bytes = vec![0; reader.layout().size_bytes()];
     let info = ddx_video::frame::FrameInfo::default();

@@ -156,7 +156,7 @@ const ACTS: [Act; 7] = [
     },
     Act {
         key: "seen",
-        text: "base looks at robot1/cam",
+        text: "base looks at robot1/cam (Big Buck Bunny, (c) 2008 Blender Foundation, CC BY 3.0)",
         deed: Deed::See,
         seconds: 3.0,
     },

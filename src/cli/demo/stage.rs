@@ -94,6 +94,7 @@ impl Stage {
         let dir = Dir::create()?;
         write(&dir.0.join("key"), key::text()?.as_bytes())?;
         write(&dir.0.join("gps.nmea"), LOG)?;
+        write(&dir.0.join("bunny.y4m"), CLIP)?;
         let (mut robot, mut base) = (Actor::new("robot1", &dir.0), Actor::new("base", &dir.0));
         let ground = match lay_cable(&mut robot, &mut base) {
             Ok(()) => Ground::Namespaces,
@@ -129,10 +130,10 @@ impl Stage {
             .start_program(nmea.map(OsString::from).into_iter().chain([log.into()]))?;
         let system = ["source", "system", "--name", "sys", "--rate", "10"];
         self.robot.start_program(system.map(OsString::from))?;
-        let video = [
-            "video", "pattern", "--name", "cam", "--size", "320x240", "--rate", "10",
-        ];
-        self.robot.start_program(video.map(OsString::from))?;
+        let clip = self.dir.0.join("bunny.y4m");
+        let video = ["video", "load", "--name", "cam", "--loop"];
+        self.robot
+            .start_program(video.map(OsString::from).into_iter().chain([clip.into()]))?;
         Ok(seed)
     }
 
@@ -440,8 +441,11 @@ const INSIDE: &str = "DDX_DEMO_INSIDE";
 const PATIENCE: Duration = Duration::from_secs(2);
 /// Where a browser sees what base sees; whichever port is free, so that two shows do not meet.
 const SERVED: &str = "127.0.0.1:0";
-/// The real log of a GPS receiver; see `deploy/data/NOTICE`.
+/// The real log of a GPS receiver; see `deploy/data/NOTICE`. What is played is in the program, which runs without a
+/// checkout too.
 const LOG: &[u8] = include_bytes!("../../../deploy/data/gps.nmea");
+/// A real film; see the same.
+const CLIP: &[u8] = include_bytes!("../../../deploy/data/bunny.y4m");
 
 #[cfg(test)]
 mod tests {
