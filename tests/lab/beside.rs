@@ -53,58 +53,49 @@ fn a_viewer_behind_a_slow_link_changes_nothing_for_a_fast_one_nor_for_the_writer
     );
 }
 
-/// With few cores bulk takes the threads' time wherever it goes: what it takes of the link shows beside the same bulk on another.
+/// What waits here waits for the link, not for a core: the kernel is the link, since a thread that is one wants a core for each
+/// frame, and the programs that fill and read 6 MiB give way to others.
 #[test]
 fn commands_pass_large_samples() {
-    let Some(site) = Site::new(&["robot1", "base", "other"]) else {
+    let Some(site) = Site::new(&["robot1", "base"]) else {
         return;
     };
+    let shape = "tc qdisc add dev eth0 root tbf rate 100mbit burst 4kb latency 100ms";
+    site.lab.host("robot1").shell(shape).unwrap();
     let (mut pilot, mut actor) = (site.program("robot1"), site.program("base"));
     pilot.open_writers("robot1/command", 1);
     pilot.write(0);
-    let mut bulks = ["base", "other"].map(|host| {
-        site.link(host, "lan --rate 100Mbit/s");
-        let (mut camera, mut viewer) = (site.program("robot1"), site.program(host));
-        let item = format!("robot1/cloud-of-{host}");
-        camera.open_large_writers(&item, 1, u32::try_from(BULK_BYTES).unwrap());
-        camera.write(0);
-        viewer.open_readers(&item, 1);
-        viewer.read(0, PATIENCE);
-        (camera, viewer)
-    });
+    let [mut camera, mut viewer] =
+        ["robot1", "base"].map(|host| Program::start_last(site.lab.host(host)));
+    camera.open_large_writers("robot1/cloud", 1, u32::try_from(BULK_BYTES).unwrap());
+    camera.write(0);
+    viewer.open_readers("robot1/cloud", 1);
+    viewer.read(0, PATIENCE);
     let asked = Asked {
         priority: Priority::Command,
         ..Asked::default()
     };
     actor.open_readers_as("robot1/command", 1, asked);
     actor.read(0, PATIENCE);
-    // The paths learn their rates and the lengths of their datagrams.
-    for (bulk, link) in bulks.iter_mut().zip(LINKS) {
-        command(&mut pilot, &mut actor, link, Some(bulk));
+    let mut bulk = (camera, viewer);
+    row("commands      read/s   p50 ms   p99 ms   bulk/s");
+    // The path learns its rate and the length of its datagrams.
+    command(&mut pilot, &mut actor, Some(&mut bulk));
+
+    let (mut alone, mut beside) = (Best::default(), Best::default());
+    for _ in 0..COMMAND_ROUNDS {
+        alone.add(command(&mut pilot, &mut actor, None));
+        beside.add(command(&mut pilot, &mut actor, Some(&mut bulk)));
     }
 
-    let mut alone = Best::default();
-    let mut beside = [Best::default(); 2];
-    row("commands                 read/s   p50 ms   p99 ms   bulk/s");
-    for _ in 0..ROUNDS {
-        alone.add(command(&mut pilot, &mut actor, "alone", None));
-        for ((best, bulk), link) in beside.iter_mut().zip(&mut bulks).zip(LINKS) {
-            best.add(command(&mut pilot, &mut actor, link, Some(bulk)));
-        }
-    }
-
-    let [same, other] = beside;
+    assert!(beside.beside >= 0.5, "no bulk crossed: {beside:?}");
     assert!(
-        same.beside >= 0.5 && other.beside >= 0.5,
-        "no bulk crossed: {beside:?}"
+        beside.rate >= 0.95 * alone.rate,
+        "commands are left out: {beside:?} against {alone:?}"
     );
     assert!(
-        same.rate >= 0.95 * alone.rate,
-        "commands are left out: {same:?} against {alone:?}"
-    );
-    assert!(
-        same.p50 <= alone.p50 + PROMISED && same.p99 <= other.p99 + TRIES,
-        "commands wait for bulk: {same:?} against {other:?} on another link and {alone:?}"
+        beside.p50 <= alone.p50 + PROMISED && beside.p99 <= alone.p99 + PROMISED,
+        "commands wait for bulk: {beside:?} against {alone:?}"
     );
 }
 
@@ -195,7 +186,6 @@ fn view(robot: &mut Program, fast: &mut Program, mut slow: Option<&mut Program>)
 fn command(
     pilot: &mut Program,
     actor: &mut Program,
-    what: &str,
     mut beside: Option<&mut (Program, Program)>,
 ) -> Best {
     if let Some((camera, viewer)) = &mut beside {
@@ -205,8 +195,8 @@ fn command(
     actor.tell_read_for(RUN);
     pilot.tell(&Order::Write {
         first: 1,
-        count: 150,
-        period_us: 10_000,
+        count: 750,
+        period_us: 2_000,
         bytes: 64,
     });
     let ages = actor.read_for_told(RUN)[0].ages;
@@ -224,7 +214,12 @@ fn command(
         ..Best::default()
     };
     row(&format!(
-        "{what:<24} {:>6.1} {:>8.2} {:>8.2} {:>8.1}",
+        "{:<12} {:>7.1} {:>8.2} {:>8.2} {:>8.1}",
+        if beside.is_some() {
+            "beside bulk"
+        } else {
+            "alone"
+        },
         run.rate,
         ms(run.p50),
         ms(run.p99),
@@ -253,11 +248,8 @@ fn ms(time: Duration) -> f64 {
 }
 
 const PROMISED: Duration = Duration::from_millis(1);
-/// What piles up while the sender tries whether more goes, and while a thread that is the link is kept waiting.
-const TRIES: Duration = Duration::from_millis(4);
-/// Where bulk goes.
-const LINKS: [&str; 2] = ["beside bulk", "bulk on another link"];
 const BULK_BYTES: usize = 6 << 20;
 const ROUNDS: usize = 3;
+const COMMAND_ROUNDS: usize = 5;
 /// Longer than what is written in it takes.
 const RUN: Duration = Duration::from_secs(2);

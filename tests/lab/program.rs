@@ -112,7 +112,18 @@ pub(crate) struct Program {
 impl Program {
     /// Starts it in `host`; it opens the store of that host's daemon.
     pub(crate) fn start(host: Host<'_>) -> Self {
-        let binary = std::env::current_exe().unwrap();
+        Self::start_by(host, Command::new(std::env::current_exe().unwrap()))
+    }
+
+    /// Starts it in `host`, where it gets the cores that no other program wants.
+    pub(crate) fn start_last(host: Host<'_>) -> Self {
+        let mut nice = Command::new("nice");
+        nice.args(["-n", "19"])
+            .arg(std::env::current_exe().unwrap());
+        Self::start_by(host, nice)
+    }
+
+    fn start_by(host: Host<'_>, mut command: Command) -> Self {
         let arguments = [
             "--exact",
             "program::worker::run",
@@ -120,7 +131,7 @@ impl Program {
             "--nocapture",
             "--test-threads=1",
         ];
-        let process = host.spawn(Command::new(binary).args(arguments)).unwrap();
+        let process = host.spawn(command.args(arguments)).unwrap();
         process.wait_line(|line| line == READY, PATIENCE).unwrap();
         Self { process, told: 0 }
     }
