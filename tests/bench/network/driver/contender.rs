@@ -22,7 +22,9 @@ pub(crate) struct Contender {
     sealed: bool,
     /// Whether each host needs a daemon, which is `ddx up`.
     pub(crate) has_daemon: bool,
-    /// Whether it is what no design can beat, so that nobody is compared with it.
+    /// Whether the daemon's threads never sleep.
+    pub(crate) spins: bool,
+    /// Whether nobody is compared with it: what no design can beat, or what takes whole cores.
     pub(crate) is_floor: bool,
 }
 
@@ -47,6 +49,7 @@ const PLAIN: Contender = Contender {
     is_extra: false,
     sealed: false,
     has_daemon: false,
+    spins: false,
     is_floor: false,
 };
 
@@ -57,6 +60,15 @@ pub(crate) const CONTENDERS: &[Contender] = &[
         words: &["program", "ddx"],
         sealed: true,
         has_daemon: true,
+        ..PLAIN
+    },
+    Contender {
+        name: "ddx-spin",
+        words: &["program", "ddx"],
+        sealed: true,
+        has_daemon: true,
+        spins: true,
+        is_floor: true,
         ..PLAIN
     },
     Contender {
@@ -132,7 +144,7 @@ pub(crate) const CONTENDERS: &[Contender] = &[
 impl Contender {
     /// Whether nothing of others is needed.
     pub(crate) fn is_own(&self) -> bool {
-        self.program.is_none() && !self.reliable
+        self.program.is_none() && !self.reliable && !self.spins
     }
 
     /// The command of one of its programs, up to `pub` or `sub`.

@@ -82,6 +82,7 @@ impl Session {
             for host in lab.hosts() {
                 let mut daemon = Command::new(&build.ddx);
                 daemon.args(["up", "--key", KEY]).env("RUST_LOG", "warn");
+                daemon.env("DDX_SPIN", contender.spins.to_string());
                 daemons.push(host.spawn(&daemon)?);
             }
         }

@@ -298,7 +298,7 @@ Most: written without pause, and again at 1.1 of what arrived where much was mis
 samples a second, none counted twice, and all readers' samples by the processor time of all programs and daemons. `missing` \
 of those was lost, or overwritten by newer ones where a system delivers the newest.\n\
 `wire` is what all hosts sent, from the IP header on. Loss strikes each way on each reader's link. `x best` is 1 for the best \
-of its row, bare UDP aside; more is worse. A dash: not carried, or no figure.\n";
+of its row, bare UDP and ddx-spin (whose daemons do not sleep) aside; more is worse. A dash: not carried, or no figure.\n";
 /// The goal for latency is the best up to this size.
 const SMALL: usize = 1_400;
 
