@@ -29,6 +29,7 @@ mod matrix;
 mod paths;
 mod seeds;
 mod share;
+mod video;
 
 use std::time::Duration;
 

@@ -146,6 +146,26 @@ pub(super) fn lacking(
     Some(lacking.sum())
 }
 
+/// The fragments, by their numbers, with which a sample can be restored: of each block as many of those that are missing as its
+/// parities do not make up for. `None` if it can have no parities.
+pub(super) fn wanted(
+    count: usize,
+    parities: u8,
+    has: impl Fn(usize) -> bool,
+    has_parity: impl Fn(usize) -> bool,
+) -> Option<Vec<usize>> {
+    let blocks = Blocks::new(count, parities.into())?;
+    let mut wanted = Vec::new();
+    for block in 0..blocks.blocks {
+        let made_up = blocks.parities(block).filter(|index| has_parity(*index));
+        let missing = blocks.fragments(block).filter(|index| !has(*index));
+        let lacking = missing.clone().count().saturating_sub(made_up.count());
+        wanted.extend(missing.take(lacking));
+    }
+    wanted.sort_unstable();
+    Some(wanted)
+}
+
 /// How fragments and parities are shared among blocks.
 #[derive(Clone, Copy, Debug)]
 struct Blocks {
@@ -280,15 +300,35 @@ mod tests {
         let lost = [200, 300, 700, 1_000];
         let (_, step) = carry(&mut transfer, &mut reassembly, |at| lost.contains(&at));
         assert_eq!(step, None);
-        // Three are missing and one parity is here; and nothing is asked for while more may come.
+        // Three are missing and one parity is here, the last: what comes later took another way.
         let at = reassembly.deadline().unwrap();
-        assert_eq!(at, Time(0) + RTT / 2);
+        assert_eq!(at, Time(0) + Duration::from_millis(5));
         let (_, due) = reassembly.due(at).unwrap();
         assert_eq!(due, Due::Ask(vec![(200, 200)]));
         transfer.ask(200, 200, FLIGHT, at);
         assert!(!transfer.repairs());
         transfer.ask(200, 200, FLIGHT, Time(0) + RTT);
         assert!(transfer.repairs());
+    }
+
+    #[test]
+    fn nothing_is_asked_for_while_parities_may_come() {
+        let transfer = Transfer::new(meta(), sample(), 100, Time(0));
+        let (mut transfer, mut reassembly) = (transfer.protect(2), Reassembly::new(10_000));
+        let (_, step) = carry(&mut transfer, &mut reassembly, |at| {
+            at == 200 || at >= 1_000
+        });
+        assert_eq!(step, None);
+        let at = reassembly.deadline().unwrap();
+        assert_eq!(at, Time(0) + RTT / 2);
+    }
+
+    #[test]
+    fn what_is_asked_for_is_of_the_blocks_that_lack_it() {
+        // Two blocks of 50, of which one has lost more than its parity makes up for, behind what the other has lost.
+        let has = |index: usize| ![0, 1, 3].contains(&index);
+        assert_eq!(wanted(100, 2, has, |_| true), Some(vec![1]));
+        assert_eq!(wanted(100, 2, has, |index| index == 1), Some(vec![0, 1]));
     }
 
     #[test]
@@ -375,6 +415,13 @@ mod tests {
             prop_assert_eq!(lacking(data, count, has, |_| true), Some(0));
             let gone = (0..data).filter(|index| lost(*index)).count();
             prop_assert_eq!(lacking(data, count, has, |_| false), Some(gone));
+            // Any parities will do, and what is wanted beside them is all that it takes.
+            let here = |index: usize| !(usize::from(byte) + index).is_multiple_of(3);
+            let asked = wanted(data, count, has, here).unwrap();
+            prop_assert_eq!(Some(asked.len()), lacking(data, count, has, here));
+            prop_assert!(asked.iter().all(|index| !has(*index)));
+            let answered = |index: usize| has(index) || asked.contains(&index);
+            prop_assert_eq!(lacking(data, count, answered, here), Some(0));
             let mut short = holed.clone();
             prop_assert!(!restore(&mut short, step, has, |_| None, count));
             prop_assert!(restore(&mut holed, step, has, parity, count));

@@ -77,6 +77,8 @@ struct Partial {
     patience: Duration,
     /// Requests since the last fragment.
     asked: u32,
+    /// Whether what comes now was asked for: the sender is done with it otherwise.
+    repaired: bool,
 }
 
 impl Reassembly {
@@ -134,6 +136,7 @@ impl Reassembly {
                 round_trip: rules.round_trip,
                 patience: rules.patience,
                 asked: 0,
+                repaired: false,
             };
             self.partials.insert(place, partial);
         }
@@ -164,9 +167,11 @@ impl Reassembly {
             Added::Part => {
                 // A gap is asked for soon, the end of the sample once nothing comes any more. Where parities are to come
                 // they may close the gap.
+                let soon = now + REORDERING + partial.patience;
                 if partial.has_gap() && partial.parities_of == 0 {
-                    let wait = REORDERING + partial.patience;
-                    self.deadlines.set_earlier(place, now + wait);
+                    self.deadlines.set_earlier(place, soon);
+                } else if partial.is_sent() {
+                    self.deadlines.set(place, soon);
                 } else {
                     self.deadlines.set(place, now + partial.tail_wait());
                 }
@@ -225,6 +230,7 @@ impl Reassembly {
             return Some((place, Due::Expired(meta)));
         }
         let is_quiet = now.since(partial.last) >= partial.tail_wait();
+        partial.repaired |= is_quiet || partial.is_sent();
         let parts = partial.missing(is_quiet);
         // The answer takes a round trip, and comes at the sender's pace. A burst of loss ends only when something is sent.
         let backoff = 1 << partial.asked.min(1);
@@ -293,33 +299,48 @@ impl Partial {
         self.ranges.len() > 1 || self.ranges.first().is_some_and(|(start, _)| *start > 0)
     }
 
+    /// Whether the last of its parities has come, or what was asked for comes.
+    fn is_sent(&self) -> bool {
+        let last = self.parities_of.checked_sub(1);
+        last.is_some_and(|last| self.repaired || self.parities.contains_key(&last))
+    }
+
     /// How long nothing may come before the rest of the sample is asked for too.
     fn tail_wait(&self) -> Duration {
         TAIL.max(self.round_trip / 2) + self.patience
     }
 
-    /// The parts that lie between those that came, and the rest when `with_tail`. Where there are parities only as many as
-    /// these do not make up for.
+    /// The parts that lie between those that came, and the rest when `with_tail`. Where there are parities only those with which
+    /// it can be restored.
     fn missing(&self, with_tail: bool) -> Vec<(u32, u32)> {
-        let mut parts = Vec::new();
+        let mut parts: Vec<(u32, u32)> = Vec::new();
+        if let Some(wanted) = self.wanted() {
+            for index in wanted {
+                let start = index * self.step;
+                let len = self.step.min(self.bytes.len() - start);
+                let (Ok(offset), Ok(len)) = (u32::try_from(start), u32::try_from(len)) else {
+                    break;
+                };
+                if let Some((from, until)) = parts.last_mut()
+                    && *from + *until == offset
+                {
+                    *until += len;
+                } else if parts.len() < PARTS_MAX {
+                    parts.push((offset, len));
+                }
+            }
+            return parts;
+        }
         let mut from = 0;
-        let mut enough = match self.parities.is_empty() {
-            true => usize::MAX,
-            false => self
-                .lacking()
-                .unwrap_or(usize::MAX)
-                .saturating_mul(self.step),
-        };
         let end = with_tail.then_some((self.bytes.len(), self.bytes.len()));
         for (start, until) in self.ranges.iter().copied().chain(end) {
-            let len = (start - from).min(enough);
+            let len = start - from;
             if len > 0
                 && let (Ok(offset), Ok(len)) = (u32::try_from(from), u32::try_from(len))
             {
                 parts.push((offset, len));
             }
-            enough -= len;
-            if parts.len() == PARTS_MAX || enough == 0 {
+            if parts.len() == PARTS_MAX {
                 break;
             }
             from = until;
@@ -340,6 +361,20 @@ impl Partial {
     fn lacking(&self) -> Option<usize> {
         let total = self.bytes.len();
         parity::lacking(
+            total.div_ceil(self.step.max(1)),
+            self.parities_of,
+            |index| self.has(index, total),
+            |index| self.parity(index).is_some(),
+        )
+    }
+
+    /// The fragments with which it can be restored; `None` while it is not known to have parities.
+    fn wanted(&self) -> Option<Vec<usize>> {
+        let total = self.bytes.len();
+        if self.parities.is_empty() {
+            return None;
+        }
+        parity::wanted(
             total.div_ceil(self.step.max(1)),
             self.parities_of,
             |index| self.has(index, total),
