@@ -5,6 +5,7 @@ mod pattern;
 mod save;
 mod serve;
 mod snap;
+mod split;
 mod v4l2;
 mod view;
 
@@ -34,6 +35,8 @@ pub(crate) enum Verb {
     Serve(serve::Args),
     /// Save the present frame as a picture
     Snap(snap::Args),
+    /// Take pictures of alternate lines apart, into an item whose frames have two fields
+    Split(split::Args),
     /// Show a stream in the terminal
     View(view::Args),
 }
@@ -47,6 +50,7 @@ pub(crate) fn run(context: &mut Context, verb: &Verb) -> Outcome {
         Verb::Save(args) => save::run(context, args),
         Verb::Serve(args) => serve::run(context, args),
         Verb::Snap(args) => snap::run(context, args),
+        Verb::Split(args) => split::run(context, args),
         Verb::View(args) => view::run(context, args),
     }
 }

@@ -49,6 +49,14 @@ pub enum Error {
         "its fields differ in format, width or colours, so that they make no common picture (hint: take one of them)"
     )]
     Stacked,
+    /// Alternate rows make no two pictures of one size.
+    #[error("{height} rows make no two pictures of one size (hint: a multiple of {step} does)")]
+    Rows {
+        /// Rows of the picture.
+        height: u32,
+        /// What they should be a multiple of.
+        step: u32,
+    },
     /// A frame is not like those before it.
     #[error("the size or format of the frames has changed")]
     Changed,

@@ -13,6 +13,7 @@ pub mod gather;
 pub mod pattern;
 pub mod picture;
 pub mod scale;
+pub mod split;
 pub mod y4m;
 
 use ddx_wire::ItemName;
