@@ -4,7 +4,7 @@ use anyhow::Result;
 
 use crate::programs::Programs;
 use crate::table::Table;
-use crate::{cost, fallover, local, network};
+use crate::{cost, fallover, local, network, video};
 
 /// A run of the bench.
 pub(crate) struct Bench {
@@ -32,6 +32,9 @@ pub(crate) const LINES: &[Line] = &[
     ("idle", network::idle),
     ("cold", network::cold),
     ("fallover", fallover::fallover),
+    ("video", video::video),
+    ("raw", video::raw),
+    ("replay", video::replay),
 ];
 
 impl Bench {

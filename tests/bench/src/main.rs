@@ -24,6 +24,7 @@ mod contender;
 mod cost;
 mod fallover;
 mod floor;
+mod frames;
 mod local;
 mod network;
 mod pair;
@@ -31,6 +32,7 @@ mod programs;
 mod role;
 mod stats;
 mod table;
+mod video;
 
 /// Measures ddx beside floors and peers.
 #[derive(Parser)]
@@ -50,7 +52,7 @@ struct Run {
     /// Print one JSON document
     #[arg(long)]
     json: bool,
-    /// Lines to measure: write wake poll large readers memory hosts spin idle cold fallover [default: all]
+    /// Lines to measure: write wake poll large readers memory hosts spin idle cold fallover video raw replay [default: all]
     lines: Vec<String>,
 }
 

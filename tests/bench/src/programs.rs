@@ -61,6 +61,13 @@ impl Programs {
         self.peers.is_some()
     }
 
+    /// The peer's program in a part.
+    pub(crate) fn peer_command(&self, part: &str) -> Result<Command> {
+        let mut command = Command::new(self.peers.as_ref().context("no peer is built")?);
+        command.arg(part);
+        Ok(command)
+    }
+
     /// What the peer measured: the figures that it prints, one a line.
     pub(crate) fn peer<T: std::str::FromStr>(&self, arguments: &[&str]) -> Result<Vec<T>> {
         let peers = self.peers.as_ref().context("no peer is built")?;

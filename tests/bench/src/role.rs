@@ -16,6 +16,7 @@ use crate::contender::{Copies, CopiesReader};
 use crate::fallover;
 use crate::floor::{FloorReader, FloorWriter, Shared, WORDS};
 use crate::pair::{Send64, Take64, now_ns};
+use crate::video;
 
 /// Values that a sink takes before it counts.
 const WARM_UP: usize = 100;
@@ -44,6 +45,23 @@ pub(crate) enum Role {
         count: usize,
         #[command(subcommand)]
         way: Way,
+    },
+    /// Publishes frames.
+    FramesOut {
+        #[arg(long)]
+        socket: Option<PathBuf>,
+        name: String,
+        bytes: usize,
+        rate: u32,
+        count: u32,
+    },
+    /// Looks at frames.
+    FramesIn {
+        #[arg(long)]
+        socket: Option<PathBuf>,
+        name: String,
+        bytes: usize,
+        count: u32,
     },
     /// From shared memory to sealed datagrams.
     RelayOut { path: PathBuf, to: SocketAddrV4 },
@@ -76,6 +94,19 @@ impl Role {
             Self::Pause { name } => fallover::pause(&name),
             Self::Source(way) => source(way.sender()?),
             Self::Sink { count, way } => sink(count, way.taker()?),
+            Self::FramesOut {
+                socket,
+                name,
+                bytes,
+                rate,
+                count,
+            } => video::feed(&store(socket)?, &name, bytes, rate, count),
+            Self::FramesIn {
+                socket,
+                name,
+                bytes,
+                count,
+            } => video::view(&store(socket)?, &name, bytes, count),
             Self::RelayOut { path, to } => relay_out(Shared::open(&path)?, to),
             Self::RelayIn { port, path } => relay_in(port, Shared::open(&path)?),
         }
@@ -102,6 +133,15 @@ impl Way {
             Self::Futex { path } => Box::new(FloorReader::new(Shared::open(&path)?, true)),
         })
     }
+}
+
+fn store(socket: Option<PathBuf>) -> Result<Store> {
+    let options = Store::options();
+    let options = match socket {
+        Some(socket) => options.socket(socket),
+        None => options,
+    };
+    Ok(options.open()?)
 }
 
 fn source(mut sender: Box<dyn Send64>) -> Result<()> {

@@ -24,6 +24,13 @@ impl Contest {
         Ok(contest)
     }
 
+    /// What two have measured in turns.
+    pub(crate) fn of(rounds: impl Iterator<Item = (Vec<f64>, Vec<f64>)>) -> Self {
+        Self {
+            rounds: rounds.map(|(ours, theirs)| vec![ours, theirs]).collect(),
+        }
+    }
+
     /// Median over the rounds of one contender's figure.
     pub(crate) fn figure(&self, contender: usize, figure: usize) -> f64 {
         median(self.rounds.iter().map(|round| round[contender][figure]))

@@ -1,7 +1,8 @@
 //! iceoryx2 in the same measurements as ddx: the two share the code that measures.
 //!
 //! `write COUNT` and `read COUNT` print the processor time of one, nanoseconds; `wake`, `poll` and `large` with `COUNT CORES`
-//! print the latencies of a conversation, nanoseconds, one a line.
+//! print the latencies of a conversation, nanoseconds, one a line. `frames-out NAME BYTES RATE COUNT` publishes frames, and `frames-in NAME
+//! BYTES COUNT` looks at them; both print the processor time of one.
 
 use std::sync::Barrier;
 
@@ -16,6 +17,8 @@ use iceoryx2::prelude::*;
 
 use crate::pair::{Cores, Send64, Side, Take64, cpu_ns_each, ping_pong};
 
+#[path = "../../src/frames.rs"]
+mod frames;
 #[path = "../../src/pair.rs"]
 mod pair;
 
@@ -34,7 +37,14 @@ fn main() -> Result<()> {
         ["wake", count, on] => print(published::<WORDS>(count.parse()?, cores(on))?),
         ["large", count, on] => print(published::<LARGE_WORDS>(count.parse()?, cores(on))?),
         ["poll", count, on] => print(polled(count.parse()?, cores(on))?),
-        _ => bail!("usage: ddx-bench-peers write|read COUNT | wake|large|poll COUNT CORES"),
+        ["frames-out", name, bytes, rate, count] => {
+            feed(name, bytes.parse()?, rate.parse()?, count.parse()?)?;
+        }
+        ["frames-in", name, bytes, count] => view(name, bytes.parse()?, count.parse()?)?,
+        _ => bail!(
+            "usage: ddx-bench-peers write|read COUNT | wake|large|poll COUNT CORES | frames-out NAME BYTES RATE COUNT | \
+             frames-in NAME BYTES COUNT"
+        ),
     }
     Ok(())
 }
@@ -233,6 +243,64 @@ fn published<const N: usize>(count: usize, cores: Cores) -> Result<Vec<u64>> {
         }
     };
     ping_pong(count, cores, side("there", "back"), side("back", "there"))
+}
+
+/// Who may listen to a stream of frames.
+const VIEWERS: usize = 16;
+
+fn feed(name: &str, bytes: usize, rate: u32, count: u32) -> Result<()> {
+    let node = NodeBuilder::new().create::<ipc::Service>()?;
+    let name: ServiceName = name.try_into().ok().context("naming a service")?;
+    let service = node
+        .service_builder(&name)
+        .publish_subscribe::<[u8]>()
+        .max_subscribers(VIEWERS)
+        .open_or_create()?;
+    let event = node
+        .service_builder(&name)
+        .event()
+        .max_listeners(VIEWERS)
+        .open_or_create()?;
+    let publisher = service
+        .publisher_builder()
+        .initial_max_slice_len(bytes)
+        .create()?;
+    let notifier = event.notifier_builder().create()?;
+    let frame = vec![128; bytes];
+    frames::feed(rate, count, || {
+        let loan = publisher.loan_slice_uninit(bytes)?;
+        loan.write_from_slice(&frame).send()?;
+        notifier.notify()?;
+        Ok(())
+    })
+}
+
+fn view(name: &str, bytes: usize, count: u32) -> Result<()> {
+    let node = NodeBuilder::new().create::<ipc::Service>()?;
+    let name: ServiceName = name.try_into().ok().context("naming a service")?;
+    let service = node
+        .service_builder(&name)
+        .publish_subscribe::<[u8]>()
+        .max_subscribers(VIEWERS)
+        .open_or_create()?;
+    let event = node
+        .service_builder(&name)
+        .event()
+        .max_listeners(VIEWERS)
+        .open_or_create()?;
+    let subscriber = service.subscriber_builder().create()?;
+    let listener = event.listener_builder().create()?;
+    frames::view(count, || {
+        loop {
+            if let Some(sample) = subscriber.receive()? {
+                if sample.payload().len() != bytes {
+                    bail!("a frame of another size");
+                }
+                return Ok(());
+            }
+            listener.blocking_wait(|_| {})?;
+        }
+    })
 }
 
 /// Names of this process only: what another run has left behind does not matter.
