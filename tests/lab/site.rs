@@ -151,8 +151,20 @@ impl Site {
     /// Waits until `host` sends an item below `prefix` to so many hosts by this path.
     #[track_caller]
     pub(crate) fn wait_path(&self, host: &str, prefix: &str, path: &str, readers: usize) {
+        self.wait_path_within(host, prefix, (path, readers), PATIENCE);
+    }
+
+    /// The same by a deadline.
+    #[track_caller]
+    pub(crate) fn wait_path_within(
+        &self,
+        host: &str,
+        prefix: &str,
+        (path, readers): (&str, usize),
+        deadline: Duration,
+    ) {
         let what = format!("{host} to send {prefix} by {path} to {readers}");
-        wait(&what, PATIENCE, || {
+        wait(&what, deadline, || {
             let routes = self.ddx(host, &["get", "@/routes"]);
             let routes = routes[0]["value"].as_array().cloned().unwrap_or_default();
             let is_settled = routes.iter().any(|route| {
