@@ -250,6 +250,6 @@ fn ms(time: Duration) -> f64 {
 const PROMISED: Duration = Duration::from_millis(1);
 const BULK_BYTES: usize = 6 << 20;
 const ROUNDS: usize = 3;
-const COMMAND_ROUNDS: usize = 5;
+const COMMAND_ROUNDS: usize = 4;
 /// Longer than what is written in it takes.
 const RUN: Duration = Duration::from_secs(2);
