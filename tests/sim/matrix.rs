@@ -84,17 +84,7 @@ impl Path {
 
 impl Play {
     fn new(seed: u64, profile: &Profile, delivery: Delivery) -> Self {
-        let quiet = Link {
-            loss: 0.0,
-            duplicates: 0.0,
-            delay: Duration::ZERO,
-            jitter: Duration::ZERO,
-        };
-        let mut sim = Sim::new(Setup {
-            link: quiet,
-            ..Setup::lan(seed, 2, 0.0)
-        });
-        sim.set_profile(1, 0, profile);
+        let mut sim = two_hosts(seed, profile);
         let item = sim.announce(0, "cam");
         let contract = Contract {
             delivery,
@@ -129,6 +119,22 @@ impl Play {
             .copied()
             .unwrap_or_default()
     }
+}
+
+/// Two hosts, of which the second's link is that of a profile, and the first one's is quiet.
+pub(crate) fn two_hosts(seed: u64, profile: &Profile) -> Sim {
+    let quiet = Link {
+        loss: 0.0,
+        duplicates: 0.0,
+        delay: Duration::ZERO,
+        jitter: Duration::ZERO,
+    };
+    let mut sim = Sim::new(Setup {
+        link: quiet,
+        ..Setup::lan(seed, 2, 0.0)
+    });
+    sim.set_profile(1, 0, profile);
+    sim
 }
 
 fn ms(span: Duration) -> f64 {

@@ -1,11 +1,9 @@
 //! Frames of video, each wanted, over a link that loses some of their fragments.
 
-use std::time::Duration;
-
 use ddx_rig::link::Profile;
-use ddx_rig::sim::{Link, Setup, Sim};
 use ddx_wire::{Contract, Delivery};
 
+use super::matrix::two_hosts;
 use super::{millis, secs};
 
 #[test]
@@ -29,18 +27,8 @@ fn frames_arrive_soon_though_each_loses_some_fragments() {
 
 /// Writes 150 frames of 640x480 at 30 a second, of which a ring holds a quarter of a second: how long each takes, ms.
 fn frames(seed: u64, delay_ms: u32, percent: u32) -> Vec<u64> {
-    let quiet = Link {
-        loss: 0.0,
-        duplicates: 0.0,
-        delay: Duration::ZERO,
-        jitter: Duration::ZERO,
-    };
-    let mut sim = Sim::new(Setup {
-        link: quiet,
-        ..Setup::lan(seed, 2, 0.0)
-    });
     let profile = format!("lan --delay {delay_ms}ms --loss {percent}% --seed {seed}");
-    sim.set_profile(1, 0, &Profile::parse(&profile).unwrap());
+    let mut sim = two_hosts(seed, &Profile::parse(&profile).unwrap());
     let item = sim.announce(0, "cam");
     let contract = Contract {
         delivery: Delivery::Every,
